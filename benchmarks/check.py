@@ -12,7 +12,6 @@ import argparse
 import datetime as dt
 import json
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from benchmarks import hda
 from benchmarks.engine import measure_table_s
 from benchmarks.estimators import record_descents
 from benchmarks.images import prepare_descent_exposure
+from benchmarks.timing import elapsed_seconds
 from benchmarks.vtt import prepare_update
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
@@ -89,19 +89,12 @@ def reference_workload() -> Callable[[], object]:
 def log_ratios(hot_path: Callable[[], object], reference: Callable[[], object], runs: int) -> list[float]:
     """Return, for each run, the log of its time divided by the mean time of the reference before and after it."""
     hot_path()
-    ratios, before = [], _processor_seconds(reference)
+    ratios, before = [], elapsed_seconds(reference)
     for _ in range(runs):
-        elapsed, after = _processor_seconds(hot_path), _processor_seconds(reference)
+        elapsed, after = elapsed_seconds(hot_path), elapsed_seconds(reference)
         ratios.append(float(np.log(elapsed / (0.5 * (before + after)))))
         before = after
     return ratios
-
-
-def _processor_seconds(run: Callable[[], object]) -> float:
-    """Measure the processor time of one run."""
-    start = time.process_time()
-    run()
-    return time.process_time() - start
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,12 @@
 """Run times of a descent image, a new terrain and a complete case of the descent scenario."""
 
-import itertools
 from functools import partial
 
 import numpy as np
 
 from benchmarks.images import descent_pose, descent_scene
 from benchmarks.stages import DESCENT_STAGES, measure_stages
-from benchmarks.timing import Measurement, core_seconds
-from marsyard.campaigns.definition.campaign import Campaign
+from benchmarks.timing import Measurement, case_runner, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
@@ -37,20 +35,14 @@ def measure_case(repeats: int) -> list[Measurement]:
     """Measure complete `dimes-gusev` cases over one prepared terrain, their stages, and cases over new terrains."""
     prepared, campaign = (load_campaign("dimes-gusev", overrides) for overrides in (["location.bank=1"], []))
     prepared.scenario.prepare(prepared.base_parameters(), 0)
-    case_numbers = itertools.count()
-
-    def run_next(campaign: Campaign = prepared) -> None:
-        case = next(case_numbers)
-        campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-
+    run = case_runner()
+    run_next = partial(run, prepared)
     return [
         Measurement(
             "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=0.6
         ),
         *measure_stages("dimes-gusev case", run_next, repeats, DESCENT_STAGES),
-        Measurement(
-            "dimes-gusev case over a new terrain", core_seconds(partial(run_next, campaign), repeats), limit=0.9
-        ),
+        Measurement("dimes-gusev case over a new terrain", core_seconds(partial(run, campaign), repeats), limit=0.9),
     ]
 
 

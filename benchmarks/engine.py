@@ -13,6 +13,7 @@ from joblib import Parallel, delayed
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.timing import Measurement
+from benchmarks.validation.chaos import WithoutSharedInputs
 from marsyard.algorithms.processes import resident_bytes
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
@@ -36,17 +37,11 @@ class BusyParameters(BaseModel):
     busy_s: float = 0.0
 
 
-class BusyScenario:
+class BusyScenario(WithoutSharedInputs):
     """Scenario that occupies the processor for `busy_s` and computes nothing."""
 
     name = "busy"
     parameters_type = BusyParameters
-
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """There are no shared inputs."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         assert isinstance(parameters, BusyParameters)

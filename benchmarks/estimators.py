@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmarks.timing import Measurement
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes.homography import HomographyEstimator
-from marsyard.algorithms.dimes.phase_correlation import PhaseCorrelationEstimator
+from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.measurements import DescentMeasurements

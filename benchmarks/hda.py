@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
+from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
 from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, match_structure, motion_from_tracks
-from marsyard.algorithms.hda.footprints import map_resolution
+from marsyard.algorithms.hda.hazards import map_resolution
 from marsyard.algorithms.hda.scene import build_scene, undistort
-from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator
 from marsyard.algorithms.hda.structure import scale_factor
 from marsyard.algorithms.hda.tracking import select_features, track_features
 from marsyard.campaigns.definition.loading import load_campaign

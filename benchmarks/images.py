@@ -11,7 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from benchmarks.timing import Measurement, core_seconds
+from benchmarks import THREAD_VARIABLES
+from benchmarks.timing import Measurement, core_seconds, measure_seconds
 from marsyard.algorithms.processes import used_memory
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.images import camera_optics
@@ -148,8 +149,7 @@ def measure_memory(frames: int) -> list[Measurement]:
 
 def measure_all_cores(repeats: int) -> list[Measurement]:
     """Measure the wall-clock time of a descent frame with detector in a separate process that uses all cores."""
-    thread_variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
-    environment = os.environ | dict.fromkeys(thread_variables, str(os.cpu_count()))
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(os.cpu_count()))
     result = subprocess.run(
         [sys.executable, "-m", "benchmarks.images", str(repeats)],
         env=environment,
@@ -164,17 +164,5 @@ def measure_all_cores(repeats: int) -> list[Measurement]:
     ]
 
 
-def _wall_seconds(repeats: int) -> list[float]:
-    """Measure the wall-clock time of each exposure of the descent scene, after a warm-up exposure."""
-    expose = prepare_descent_exposure()
-    expose()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        expose()
-        times.append(time.perf_counter() - start)
-    return times
-
-
 if __name__ == "__main__":
-    print(json.dumps(_wall_seconds(int(sys.argv[1]))))
+    print(json.dumps(measure_seconds(prepare_descent_exposure(), int(sys.argv[1]), time.perf_counter)))

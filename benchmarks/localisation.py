@@ -1,11 +1,9 @@
 """Run times of complete localisation cases, and of their stages."""
 
-import itertools
 from functools import partial
 
 from benchmarks.stages import Stages, measure_stages
-from benchmarks.timing import Measurement, core_seconds
-from marsyard.campaigns.definition.campaign import Campaign
+from benchmarks.timing import Measurement, case_runner, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 
 #: Stages of a case of `loc-jezero` with the published algorithm alone.
@@ -30,16 +28,12 @@ STAGES: Stages = {
 def measure(cases: int) -> list[Measurement]:
     """Measure cases of `loc-jezero` with all algorithms, and with `lvs` alone; each one builds a terrain of its own."""
     complete, alone = (load_campaign("loc-jezero", overrides) for overrides in ([], ["compared=[]"]))
-    case_numbers = itertools.count()
-
-    def run_next(campaign: Campaign = alone) -> None:
-        case = next(case_numbers)
-        campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-
+    run = case_runner()
+    run_next = partial(run, alone)
     return [
         Measurement(
             "loc-jezero case: terrain, map, 24 frames, all algorithms",
-            core_seconds(partial(run_next, complete), cases),
+            core_seconds(partial(run, complete), cases),
             limit=6.0,
         ),
         Measurement("loc-jezero case: terrain, map, 24 frames, lvs", core_seconds(run_next, cases), limit=6.0),

@@ -30,34 +30,24 @@ from marsyard.sim.measurements import DetectorCalibration
 class ThresholdInputs:
     """Distributions of the Monte Carlo simulation; standard deviations are of normal distributions.
 
-    Attributes
-    ----------
-    descents
-        Number of descents with feasible overlap for two templates in each pair.
-    seed
-        Seed of the generator.
-    altitudes_m, interval_s
-        Altitudes of the three images and time between them (field test paper, section III.C: 2000, 1700 and 1400 m).
-    max_speed_m_s
-        Horizontal velocities are uniform over the disc of this radius (paper: 30 m/s).
-    max_cone_deg, max_nod_deg
-        Maximum tilt by coning (paper: 30 deg) and by nodding (60 deg/s at a period of 1.2 s: 11.5 deg). Tilts are
-        uniform up to the maximum in any direction, independent in each image. Rotation about the vertical is uniform.
-    common_altitude_sd, altitude_sd
-        Relative error of an altitude: common to all images, and independent (noise of the radar, and relief).
-    common_attitude_sd_deg, attitude_sd_deg
-        Attitude error per axis: common to all images (star reference and gyro drift through entry), and independent
-        (error of the time tag at the body rate).
-    feature_height_sd_m
-        Height of features relative to the level that the altimeter measures (relief).
-    match_sd_m_s
-        Velocity error of a track per axis due to the match (0.03 px with the noise of the flight camera: 0.05 m/s).
-    imu_sd_m_s
-        Error per axis of the velocity change of the IMU (gravity and the common tilt).
-    accepted_fraction
-        Fraction of descents with one correct track in each pair that must pass the check.
-    step_m_s
-        Step to which the threshold is rounded up.
+    - descents: number of descents with feasible overlap for two templates in each pair
+    - seed: seed of the generator
+    - altitudes_m, interval_s: altitudes of the three images and time between them (field test paper, section III.C:
+      2000, 1700 and 1400 m)
+    - max_speed_m_s: horizontal velocities are uniform over the disc of this radius (paper: 30 m/s)
+    - max_cone_deg, max_nod_deg: maximum tilt by coning (paper: 30 deg) and by nodding (60 deg/s at a period of 1.2 s:
+      11.5 deg); tilts are uniform up to the maximum in any direction, independent in each image; rotation about the
+      vertical is uniform
+    - common_altitude_sd, altitude_sd: relative error of an altitude: common to all images, and independent (noise of
+      the radar, and relief)
+    - common_attitude_sd_deg, attitude_sd_deg: attitude error per axis: common to all images (star reference and gyro
+      drift through entry), and independent (error of the time tag at the body rate)
+    - feature_height_sd_m: height of features relative to the level that the altimeter measures (relief)
+    - match_sd_m_s: velocity error of a track per axis due to the match (0.03 px with the noise of the flight camera:
+      0.05 m/s)
+    - imu_sd_m_s: error per axis of the velocity change of the IMU (gravity and the common tilt)
+    - accepted_fraction: fraction of descents with one correct track in each pair that must pass the check
+    - step_m_s: step to which the threshold is rounded up
     """
 
     descents: int = 10_000
@@ -199,12 +189,8 @@ def _draw_direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
 class Discrepancies:
     """Discrepancies of correct combinations of tracks from the IMU, m/s.
 
-    Attributes
-    ----------
-    one_track
-        One correct track in each pair, shape (descents,).
-    two_tracks
-        Minimum of the four combinations of two correct tracks in each pair, shape (descents,).
+    - one_track: one correct track in each pair, shape (descents,)
+    - two_tracks: minimum of the four combinations of two correct tracks in each pair, shape (descents,)
     """
 
     one_track: Float[np.ndarray, " descents"]
@@ -230,14 +216,9 @@ def threshold_m_s(
 class WrongTrackOutcomes:
     """Outcomes of the IMU check for descents with one wrong track, as fractions of the descents.
 
-    Attributes
-    ----------
-    correct
-        Reported velocity within the requirement.
-    rejected
-        No reported velocity.
-    wrong
-        Reported velocity outside the requirement.
+    - correct: reported velocity within the requirement
+    - rejected: no reported velocity
+    - wrong: reported velocity outside the requirement
     """
 
     correct: float

@@ -1,9 +1,12 @@
 """Results of a benchmark with their limits, and the measurement of processor time."""
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from marsyard.campaigns.definition.campaign import Campaign
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,28 @@ class Measurement:
 
 def core_seconds(run: Callable[[], object], repeats: int) -> list[float]:
     """Measure the processor time of each run after a warm-up run."""
+    return measure_seconds(run, repeats, time.process_time)
+
+
+def measure_seconds(run: Callable[[], object], repeats: int, clock: Callable[[], float]) -> list[float]:
+    """Measure the time of each run after a warm-up run."""
     run()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return times
+    return [elapsed_seconds(run, clock) for _ in range(repeats)]
+
+
+def elapsed_seconds(run: Callable[[], object], clock: Callable[[], float] = time.process_time) -> float:
+    """Measure the time of one run."""
+    start = clock()
+    run()
+    return clock() - start
+
+
+def case_runner() -> Callable[[Campaign], None]:
+    """Return a function that runs the next case of a campaign, which no earlier call has run."""
+    case_numbers = itertools.count()
+
+    def run_next(campaign: Campaign) -> None:
+        case = next(case_numbers)
+        campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+
+    return run_next

@@ -10,10 +10,9 @@ import numpy as np
 
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
-from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.matching import extract_patch, search_window
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker, lucas_kanade_tracker
 from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.sim.measurements import RoverMeasurements, RoverTarget

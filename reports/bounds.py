@@ -13,9 +13,8 @@ import numpy as np
 from marsyard.reports.case_evidence import Mask
 from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import attainable_risk
+from marsyard.reports.statistics.clusters import attainable_risk, count_sizes
 from marsyard.reports.statistics.sequential import SequentialTest, confidence_at
-from marsyard.reports.statistics.terrain_sizes import count_sizes
 from marsyard.reports.verdicts import Verdict
 
 

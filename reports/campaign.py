@@ -13,33 +13,30 @@ import pandas as pd
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.temporary_files import write_atomic
-from marsyard.reports import case_tables, common_sections
-from marsyard.reports.boundary import boundary_section
-from marsyard.reports.budget import budget_section
+from marsyard.reports import common_sections, tables
+from marsyard.reports.budget import budget_section, budget_sentences
 from marsyard.reports.column_selection import primary_metric
+from marsyard.reports.common_sections import consistency_section
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.consistency import consistency_section
 from marsyard.reports.convergence import convergence_section
-from marsyard.reports.driver_section import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.junit import junit_xml
-from marsyard.reports.outcome_counts import outcome_counts
-from marsyard.reports.page_context import page_context
+from marsyard.reports.influences import boundary_section, drivers_section
+from marsyard.reports.page import page_context
 from marsyard.reports.page_environment import page_environment
+from marsyard.reports.populations import outcome_counts
 from marsyard.reports.presentation import presentations
-from marsyard.reports.rare import rare_section
-from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport
-from marsyard.reports.robustness_section import robustness_section
-from marsyard.reports.robustness_sentences import robustness_text
-from marsyard.reports.search import search_section
+from marsyard.reports.provenance import read_algorithms
+from marsyard.reports.rare import rare_section, rare_sentences
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
+from marsyard.reports.robustness_section import robust_sentences, robustness_section, robustness_text
+from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Section, SectionMaker, Subject
 from marsyard.reports.signature import sign_report
-from marsyard.reports.study_sentences import describe_study
+from marsyard.reports.stored import table
 from marsyard.reports.tables import error_summaries
-from marsyard.reports.tested_algorithms import read_algorithms
-from marsyard.reports.traceability import requirement_evidence, verification_csv
-from marsyard.reports.validity_section import validity_section
+from marsyard.reports.validity import validity_section
+from marsyard.reports.verdict_files import junit_xml, requirement_evidence, verification_csv
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -86,7 +83,7 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     write_atomic(directory / JUNIT_FILE, hide_folders(junit_xml(run.name, verdicts, overall_verdict, algorithms)))
     page_file = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
-    context["evidence"] = evaluation.evidence
+    context |= {"evidence": evaluation.evidence, "study_sentences": study_sentences(run.record)}
     context["cautions"] += evaluation.validity.sentences
     for row in context["verdicts"]:
         row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
@@ -118,7 +115,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
     """Create the record of `report.json`."""
     run, overall_verdict, metric = evaluation.run, evaluation.overall_verdict, subject.metric
     summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
-    worst_rows = [] if metric is None else case_tables.worst_cases(subject.run, metric).rows
+    worst_rows = [] if metric is None else tables.worst_cases(subject.run, metric).rows
     return CampaignReport(
         schema=SCHEMA,
         campaign=run.name,
@@ -132,7 +129,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         evidence=evaluation.evidence,
         verdict=overall_verdict.word,
         sentence=overall_verdict.sentence,
-        study=describe_study(run.record),
+        study=_describe_study(run.record),
         exit_code=evaluation.exit_code,
         verdicts=tuple(evaluation.verdicts),
         outcomes=dict(outcome_counts(run.all_cases)),
@@ -144,6 +141,23 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         showcases=run.stored_cases,
         robustness=evaluation.robustness,
     )
+
+
+def study_sentences(record: Mapping[str, Any]) -> list[str]:
+    """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
+    sentences = (rare_sentences, search_sentences, budget_sentences, robust_sentences)
+    return [text for describe in sentences for text in describe(record)]
+
+
+def _describe_study(record: Mapping[str, Any]) -> StudySummary | None:
+    """Return kind, requirement and main result of a study for `report.json`; None for an ordinary campaign."""
+    study, sentences = table(record.get("study")), study_sentences(record)
+    if not study:
+        return None
+    # the first sentence of a rare study is its verdict, the second the probability
+    main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
+    sentence = "".join(main_sentences) or "The study is not finished."
+    return StudySummary(str(study.get("kind")), str(study.get("requirement") or ""), sentence)
 
 
 def _unique_values(frame: pd.DataFrame, column: str) -> tuple[str, ...]:

@@ -21,9 +21,14 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.decision import requirement_masks
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid
-from marsyard.reports.statistics.changes import Metric, Sample, difference_p_value
-from marsyard.reports.statistics.multiple_tests import correct_holm
-from marsyard.reports.statistics.paired_changes import compare_successes, symmetry_p_value
+from marsyard.reports.statistics.difference_tests import (
+    Metric,
+    Sample,
+    compare_successes,
+    correct_holm,
+    difference_p_value,
+    symmetry_p_value,
+)
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import NOTHING, label, number, p_text, percent
 
@@ -42,10 +47,14 @@ def metric_text(metric: Metric) -> str:
 class MetricComparison:
     """One metric of both campaigns, and the corrected two-sided p-value of their difference."""
 
-    name: str
     first: Metric
     second: Metric
     p_value: float
+
+    @property
+    def name(self) -> str:
+        """Name of the metric."""
+        return self.first.name
 
 
 def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
@@ -94,10 +103,7 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[M
             for pair in metric_pairs
         ]
     )
-    comparisons = [
-        MetricComparison(pair[0].name, *pair, p_value) for pair, p_value in zip(metric_pairs, p_values, strict=True)
-    ]
-    return are_paired, comparisons
+    return are_paired, [MetricComparison(*pair, p_value) for pair, p_value in zip(metric_pairs, p_values, strict=True)]
 
 
 def have_same_draws(first: StoredRun, second: StoredRun) -> bool:

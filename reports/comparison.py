@@ -2,7 +2,7 @@
 
 Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by the cases in
 which only one algorithm succeeded, errors by the differences of the cases that both answered
-(`marsyard.reports.statistics.paired_changes`). All p-values are corrected by Holm's method.
+(`marsyard.reports.statistics.difference_tests`). All p-values are corrected by Holm's method.
 """
 
 import math
@@ -18,8 +18,7 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.populations import success_mask
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.statistics.multiple_tests import correct_holm
-from marsyard.reports.statistics.paired_changes import compare_errors, compare_successes
+from marsyard.reports.statistics.difference_tests import compare_errors, compare_successes, correct_holm
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, p_text, percent
 from marsyard.scenarios.columns import split_unit
 
@@ -128,15 +127,10 @@ def compare_algorithms(
     differences = [
         compare_with_tested(frame, rows, name, metric, bound) for name, rows in frames.items() if metric in rows
     ]
-    success_p, error_p = (
-        correct_holm([difference.success_p for difference in differences]),
-        correct_holm([difference.error_p for difference in differences]),
-    )
-    corrected_p_values = zip(differences, success_p, error_p, strict=True)
-    return results, [
-        replace(difference, success_p=success_p_value, error_p=error_p_value)
-        for difference, success_p_value, error_p_value in corrected_p_values
-    ]
+    success_p = correct_holm([difference.success_p for difference in differences])
+    error_p = correct_holm([difference.error_p for difference in differences])
+    corrected = zip(differences, success_p, error_p, strict=True)
+    return results, [replace(item, success_p=p_success, error_p=p_error) for item, p_success, p_error in corrected]
 
 
 def comparison_section(subject: Subject) -> Section | None:

@@ -11,16 +11,47 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool
+from scipy import stats
 
 from marsyard.reports import populations, rates
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.statistics.drivers import mean_squares
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.terrain_variance import terrain_variance
 from marsyard.reports.wording import format_fraction, label, note_text, number, percent, plain_value
 from marsyard.scenarios.columns import split_unit
+
+
+def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
+    """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
+
+    Keys: `part` (the column), `terrains` (their number), `within_sd` of errors within a terrain, `between_sd` of the
+    terrains' means, `fraction` of the variance between terrains (intraclass correlation), `p_value` of equal means
+    (F-test).
+    """
+    groups = rates.terrain_groups(frame)
+    values = numbers(frame, column)
+    finite = np.isfinite(values) & populations.population_mask(frame, "valid")
+    if groups is None or not finite.any():
+        return None
+    _, index = np.unique(groups[finite], return_inverse=True)
+    cases, terrains = index.size, int(index.max()) + 1
+    if terrains < 2 or cases == terrains:
+        return None
+    within, between, effective_size = mean_squares(values[finite], index)
+    variance_between = max(between - within, 0.0) / effective_size
+    p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
+    return {
+        "part": column,
+        "terrains": terrains,
+        "within_sd": float(np.sqrt(within)),
+        "between_sd": float(np.sqrt(variance_between)),
+        "fraction": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
+        "p_value": p_value,
+    }
+
 
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
 CONDITIONS = (

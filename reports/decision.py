@@ -152,27 +152,17 @@ def _evaluate(
         needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, additional_cases=needed_cases if sampling.independent else None)
+    has_own_terrains = earlier is None or earlier.population.labels is None
     own = [
-        _case_evidence(verdict, mask, sampling, frame, has_own_terrains=_has_own_terrains(earlier))
+        _case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains)
         for mask in (members, members_and_unfinished)
     ]
-    joined = (
-        own
-        if earlier is None
-        else [
-            part.join_own(own_part)
-            for part, own_part in zip((earlier.population, earlier.with_unfinished), own, strict=True)
-        ]
-    )
+    earlier_parts = () if earlier is None else (earlier.population, earlier.with_unfinished)
+    joined = [part.join_own(own_part) for part, own_part in zip(earlier_parts, own, strict=True)] if earlier else own
     decided = _decide(verdict, joined[0], sampling, frame)
     if earlier is None and (members == members_and_unfinished).all():
         return decided
     return _withhold_if_uncertain(decided, _decide(verdict, joined[1], sampling, frame))
-
-
-def _has_own_terrains(earlier: RequirementEvidence | None) -> bool:
-    """Whether no other confirmation uses the terrains."""
-    return earlier is None or earlier.population.labels is None
 
 
 def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdict:

@@ -29,7 +29,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.sampling.dispersions import Choice
-from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, Changes
+from marsyard.reports.statistics.reweighted_rates import MIN_EFFECTIVE, Changes
 
 #: Number of evaluated sizes of a change; between them, rates are interpolated.
 _STEPS = 41

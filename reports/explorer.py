@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from markupsafe import Markup
 
 from marsyard.reports.column_selection import axis_columns
-from marsyard.reports.column_values import is_varying_number, numbers
+from marsyard.reports.column_values import is_number, numbers
 from marsyard.reports.populations import engine_failed
 from marsyard.reports.provenance import replay_command
 from marsyard.reports.stored import StoredRun
@@ -64,7 +64,7 @@ def explorer_data(
     explored = [
         str(name)
         for name in first_cases.columns
-        if name not in _NOT_EXPLORED and is_varying_number(first_cases, str(name))
+        if name not in _NOT_EXPLORED and is_number(first_cases, str(name)) and first_cases[name].nunique() > 1
     ]
     names = list(dict.fromkeys([*first, *explored]))
     is_violation = np.zeros(len(all_cases), dtype=np.bool_)

@@ -19,9 +19,10 @@ from marsyard.reports import figure_style
 from marsyard.reports.column_selection import axis_columns, category_column
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figure_style import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.outcome_counts import answered_outcomes, outcome_counts
 from marsyard.reports.plots import axis_edge, note_beyond
-from marsyard.reports.statistics.ellipse import error_ellipse
+from marsyard.reports.populations import answered_outcomes, outcome_counts
+from marsyard.reports.rates import finite_values
+from marsyard.reports.statistics.error_summary import error_ellipse
 from marsyard.reports.wording import format_fraction, label, magnitude_label, plain_value
 from marsyard.scenarios.columns import split_unit
 
@@ -111,9 +112,8 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
 
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
     """Whether all errors are so far below the bound that an enlarged figure is needed."""
-    magnitude = np.abs(numbers(frame, metric))
-    finite = magnitude[np.isfinite(magnitude)]
-    return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < _MIN_BOUND_FRACTION * bound
+    magnitudes = np.abs(finite_values(frame, metric))
+    return bound is not None and 0.0 < float(magnitudes.max(initial=0.0)) < _MIN_BOUND_FRACTION * bound
 
 
 @in_page_style
@@ -247,9 +247,8 @@ def _finite_magnitudes(
     frame: pd.DataFrame, metric: str, bound: float | None
 ) -> tuple[Float[np.ndarray, " finite"], float]:
     """Return the finite error magnitudes, and the end of their axis."""
-    magnitude = np.abs(numbers(frame, metric))
-    finite = magnitude[np.isfinite(magnitude)]
-    return finite, axis_edge(finite, bound)
+    magnitudes = np.abs(finite_values(frame, metric))
+    return magnitudes, axis_edge(magnitudes, bound)
 
 
 def _draw_points(

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.case_views import create_case_view
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.column_values import numbers
 from marsyard.reports.populations import population_mask
-from marsyard.reports.presentation import CaseView
+from marsyard.reports.presentation import CaseView, create_case_view
 from marsyard.reports.section import SvgFigure, svg_figure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING

@@ -13,13 +13,7 @@ from typing import Any
 from marsyard.campaigns.definition.claims import Confirmation, requirement_key
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.confirmation_record import (
-    ConfirmationRecord,
-    find_own_entry,
-    is_variant,
-    list_related_claims,
-    read_record,
-)
+from marsyard.campaigns.store.confirmation_record import find_own_entry, is_variant, list_related_claims, read_record
 from marsyard.campaigns.store.git_history import UNKNOWN, find_registration_problem
 from marsyard.reports.case_evidence import RequirementEvidence
 from marsyard.reports.verdicts import Status, Verdict
@@ -137,14 +131,10 @@ def read_joint_evidence(evidence: Evidence) -> JointEvidence:
     own = find_own_entry(record, evidence)
     if own is None:
         return JointEvidence(True, registration or f"{UNKNOWN}: {path} does not contain this run.")
-    return _joint_evidence(record, own, evidence.registration or registration)
-
-
-def _joint_evidence(record: ConfirmationRecord, own: Confirmation, registration: str) -> JointEvidence:
-    """Collect the confirmations of the claim, and related claims."""
     entries = record.of_claim(own.claim)
     others = [entry for entry in entries if entry.number != own.number]
-    return JointEvidence(True, registration, own, others, list_related_claims(record, entries))
+    related = list_related_claims(record, entries)
+    return JointEvidence(True, evidence.registration or registration, own, others, related)
 
 
 def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdict:

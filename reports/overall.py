@@ -1,5 +1,6 @@
-"""Verdict of a campaign with several requirements: overall verdict and exit status."""
+"""Verdict of a campaign with several requirements: overall verdict, exit status, and what would decide it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,10 +8,84 @@ import pandas as pd
 
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.reports.populations import engine_failed
-from marsyard.reports.remedy import find_remedy
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
+from marsyard.reports.statistics.proportions import minimum_sample_size, proportion_lower
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
-from marsyard.reports.wording import count
+from marsyard.reports.wording import count, format_fraction
+
+#: Confidence of the lower bound of the fraction of the cases that belong to a population; high, so that the stated
+#: number of cases is sufficient.
+_FRACTION_CONFIDENCE = 0.99
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """Additional cases that decide all undecided requirements without a failure.
+
+    - cases: number of cases to append; None if more cases do not help, or their number is unknown
+    - text: explanation; may be empty
+    """
+
+    cases: int | None = None
+    text: str = ""
+
+
+def find_remedy(verdicts: Sequence[Verdict], cases: int) -> Remedy:
+    """Find how many additional cases would decide all requirements, or why more cases cannot.
+
+    The number accounts for cases outside of the population of a requirement (cases without an answer, for example).
+    cases: number of cases of the campaign
+    """
+    verdict_with_advice = next((verdict for verdict in verdicts if verdict.advice), None)
+    if verdict_with_advice is not None:
+        return Remedy(None, verdict_with_advice.advice)
+    undecided_verdicts = [verdict for verdict in verdicts if verdict.additional_cases is not None]
+    if not undecided_verdicts:
+        return Remedy()
+    populated = [verdict for verdict in undecided_verdicts if verdict.n]
+    if len(populated) < len(undecided_verdicts):
+        largest = max(undecided_verdicts, key=lambda verdict: verdict.additional_cases or 0)
+        return Remedy(None, f"{_needed_text(largest)}, all without a failure, would be enough.")
+    numbers = [_cases_for(verdict, verdict.additional_cases or 0, cases) for verdict in populated]
+    number, largest = max(numbers), populated[numbers.index(max(numbers))]
+    text = f"{_needed_text(largest)}, all without a failure, would be enough"
+    if largest.population != "all":
+        text += f": about {count(number, 'case')}, of which some do not belong to the population"
+    return Remedy(number, f"{text}.{_new_campaign_text(populated, cases, cases + number)}")
+
+
+def _needed_text(verdict: Verdict) -> str:
+    """Describe the additional cases of the population of a requirement."""
+    population = f" of the population of {verdict.requirement_id}" if verdict.population != "all" else ""
+    terrain_text = "" if verdict.clustered is None else ", each on a new terrain"
+    return f"{count(verdict.additional_cases or 0, 'additional case')}{population}{terrain_text}"
+
+
+def _cases_for(verdict: Verdict, needed: int, cases: int) -> int:
+    """Compute the cases that contain `needed` cases of a population, from the lower bound of its fraction so far."""
+    if verdict.population == "all":
+        return needed
+    return math.ceil(needed / proportion_lower(verdict.n, cases, _FRACTION_CONFIDENCE))
+
+
+def _new_campaign_text(verdicts: Sequence[Verdict], cases: int, total: int) -> str:
+    """State the cases of a new campaign with one look, if it needs fewer than `total`.
+
+    Empty after a failure, because a new campaign would discard it.
+    """
+    if any(verdict.failures or verdict.decide_by == ESTIMATE for verdict in verdicts):
+        return ""
+    needed = max(
+        _cases_for(verdict, minimum_sample_size(verdict.probability, verdict.confidence), cases) for verdict in verdicts
+    )
+    if needed >= total:
+        return ""
+    design = "a new seed"
+    if any(verdict.clustered is not None for verdict in verdicts):
+        design += ", and a terrain for each case,"
+    needed_text = f"{count(needed, 'case')} (-n {needed})"
+    return f" A new campaign with {design} needs only {needed_text}, because it has one look."
+
 
 #: Headline of an exploration that meets all requirements: it is no confirmation.
 EXPLORATORY_PASS = "PASS (exploration)"  # noqa: S105  (a verdict, not a password)
@@ -103,3 +178,25 @@ def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     if has_rate_verdict or any(verdict.status is Status.INSUFFICIENT for verdict in verdicts):
         return 3
     return QUALIFIED_EXIT_CODE if any(verdict.status.is_qualified for verdict in verdicts) else 0
+
+
+def multiplicity_text(verdicts: Sequence[Verdict]) -> str:
+    """State the expected number of false PASSes and the joint confidence; empty for fewer than two requirements.
+
+    A requirement that is not met gets PASS with a probability of at most 1 - confidence (consumer's risk). The expected
+    number of false PASSes is at most the sum of these risks, for any dependence between the requirements; by Boole's
+    inequality this sum also bounds the probability of at least one false PASS.
+    """
+    risks = [1.0 - item.confidence for item in verdicts if item.n and item.decide_by != ESTIMATE]
+    # NaN and confidences outside of 0 to 1 are invalid requirements, whose verdict is not PASS
+    risks = [risk for risk in risks if 0.0 < risk < 1.0]
+    expected = sum(risks)
+    if len(risks) < 2:
+        return ""
+    text = (
+        f"{len(risks):,} requirements are decided at a confidence: if none is met, up to {expected:.2g} false "
+        "PASSes are expected among them"
+    )
+    if expected >= 1.0 - 1e-9:
+        return f"{text}. A single PASS of these is weak evidence."
+    return f"{text}. Their PASSes hold together with at least {format_fraction(1.0 - expected)} confidence."

@@ -1,8 +1,12 @@
-"""Environment of the templates of all pages: report, dashboard, and gallery of sites."""
+"""Environment of the templates of all pages (report, dashboard, gallery of sites), and data embedded in them."""
 
+import base64
+import hashlib
+import json
 import re
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -31,3 +35,16 @@ def page_environment() -> Environment:
     environment.filters["status_class"] = status_class
     environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
     return environment
+
+
+def script_hash(text: str) -> str:
+    """Compute the hash of a script for the page's content security policy."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def embed_json(data: Any) -> Markup:
+    """Convert data to JSON, escaped for a script element."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for letter in "<>&\u2028\u2029":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)  # noqa: S704

@@ -1,4 +1,4 @@
-"""Masks of populations (subsets of a campaign's cases)."""
+"""Populations (subsets of a campaign's cases) as masks, and the number of cases by outcome."""
 
 import math
 from collections.abc import Sequence
@@ -83,3 +83,22 @@ def all_flags(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
     """Create the mask of the rows in which all flags are true; names that are not flag columns are ignored."""
     masks = [flag_mask(frame, name) for name in names if is_flag(frame, name)]
     return np.asarray(np.logical_and.reduce([np.ones(len(frame), dtype=np.bool_), *masks]))
+
+
+def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
+    """Count cases by outcome: answers first, unfinished cases last, larger numbers first."""
+    if "outcome" not in frame:
+        return []
+    counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
+    pairs = [(str(name), int(count)) for name, count in counts.items()]
+    outcomes_with_answer = answered_outcomes(frame)
+    return sorted(
+        pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in outcomes_with_answer, -pair[1], pair[0])
+    )
+
+
+def answered_outcomes(frame: pd.DataFrame) -> set[str]:
+    """Return the outcomes of cases with an answer; VALID if the rows have no column `answered`."""
+    if "outcome" not in frame or not is_flag(frame, "answered"):
+        return {"VALID"}
+    return {str(name) for name in frame.loc[population_mask(frame, "valid"), "outcome"].dropna().unique()}

@@ -5,17 +5,20 @@ Each system of `marsyard.scenarios.systems` defines the import path of its prese
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from marsyard.reports.products import Products
 from marsyard.reports.section import SectionMaker
+from marsyard.reports.timeline.figure import draw_timeline
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import find_system, systems
+from marsyard.scenarios.timeline import Timeline
 
 
 @dataclass(frozen=True)
@@ -128,3 +131,36 @@ def find_case_kind(products: Products) -> CaseKind | None:
     """Find the kind of case of these products; None if no system recognizes them."""
     kinds = (kind for presentation in presentations().values() for kind in presentation.cases)
     return next((kind for kind in kinds if kind.is_case(products)), None)
+
+
+#: Resolution of figures in files.
+_FILE_DPI = 130
+#: Caption of the perspective view of a case with a timeline.
+_SPACE_CAPTION = (
+    "The case in space: visible ground, true and estimated path, and the cameras at the times of images. "
+    "`marsyard replay` with `--rerun` exports a view with a time line."
+)
+
+
+def create_case_view(products: Products, *, complete: bool) -> CaseView:
+    """Create the view of a case, without figures if no system recognizes its products.
+
+    complete: whether the view is for files, which contain all figures
+    """
+    kind, timeline = find_case_kind(products), Timeline.from_products(products)
+    view = CaseView([]) if kind is None else kind.view(products, complete)
+    space = [] if timeline is None else [CaseFigure("space", draw_timeline(timeline), _SPACE_CAPTION, wide=False)]
+    legend = kind.legend if kind is not None and view.legend is None else view.legend
+    return replace(view, figures=[*view.figures, *space], legend=legend)
+
+
+def write_case_figures(directory: Path, products: Products) -> list[Path]:
+    """Write a case's figures as PNG on white into a folder; returns their paths.
+
+    Raises OSError if they cannot be written.
+    """
+    view = create_case_view(products, complete=True)
+    figures = {directory / f"{item.name}.png": item.figure for item in view.figures}
+    for path, figure in figures.items():
+        figure.savefig(path, dpi=_FILE_DPI, facecolor="#ffffff", metadata={"Software": None})
+    return [*figures]

@@ -9,10 +9,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.hidden_folders import hide_folders
+from marsyard.reports.provenance import Algorithm
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.error_summary import ErrorSummary
-from marsyard.reports.tested_algorithms import Algorithm
 from marsyard.reports.validity import Validity
 from marsyard.reports.verdicts import Verdict
 

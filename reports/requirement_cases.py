@@ -14,13 +14,12 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.case_margins import compute_margins
-from marsyard.reports.cell_values import to_float
-from marsyard.reports.column_values import numbers
+from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.presentation import Cause, system_presentation
+from marsyard.reports.products import thumbnail
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.thumbnails import thumbnail
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, label, number, percent
 from marsyard.scenarios.columns import split_unit

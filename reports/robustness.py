@@ -8,11 +8,11 @@ any dimension. For a population with the rate m among all cases, the smallest di
 r = -log(1 - m + m exp(-r')), with the divergence r' of the two failure rates in the population.
 
 The verdict under a change is that of its own rule: PASS while the upper bound of the failure rate
-(`marsyard.reports.statistics.weighted`) is at most the permitted rate, FAIL if the lower bound is above it. Both are at
-least as wide as the bounds of the verdict, in proportion, which are wider for shared terrains, for example. The change
-to FAIL is where the estimated rate reaches the permitted rate. PASS is lost before, and FAIL shown after: these two
-changes are the interval, each with the confidence of the requirement. Weights say nothing where they are equivalent to
-fewer than 30 cases.
+(`marsyard.reports.statistics.reweighted_rates`) is at most the permitted rate, FAIL if the lower bound is above it.
+Both are at least as wide as the bounds of the verdict, in proportion, which are wider for shared terrains, for example.
+The change to FAIL is where the estimated rate reaches the permitted rate. PASS is lost before, and FAIL shown after:
+these two changes are the interval, each with the confidence of the requirement. Weights say nothing where they are
+equivalent to fewer than 30 cases.
 """
 
 from __future__ import annotations
@@ -40,9 +40,13 @@ from marsyard.reports.dispersion_changes import (
     sign_of,
 )
 from marsyard.reports.sampling_design import SamplingDesign
-from marsyard.reports.statistics.crossing import Crossing, find_crossing
-from marsyard.reports.statistics.divergence import population_divergence
-from marsyard.reports.statistics.weighted import WeightedRates, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import (
+    Crossing,
+    WeightedRates,
+    find_crossing,
+    population_divergence,
+    weighted_rates,
+)
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import number, percent
@@ -250,20 +254,13 @@ def _find_change(
         assumed = mean if change.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN) else spread
     step = sign_of(change.kind) * spread
     is_complete = is_choice and crossing.reach == float(change.sizes[-1])
+    unit = "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit
     return Robustness(
-        verdict.requirement_id,
-        path,
-        change.kind,
-        "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit,
-        assumed=assumed,
-        spread=spread,
-        passes_at=assumed + step * crossing.lower,
-        fails_at=assumed + step * crossing.change,
-        confidence=verdict.confidence,
-        outcome=ChangeOutcome.of(crossing, is_complete=is_complete),
-        value=str(dispersion.values[change.value]) if is_choice else "",
-        **asdict(crossing),
-    )
+        verdict.requirement_id, path, change.kind, unit, assumed=assumed, spread=spread,
+        passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
+        confidence=verdict.confidence, outcome=ChangeOutcome.of(crossing, is_complete=is_complete),
+        value=str(dispersion.values[change.value]) if is_choice else "", **asdict(crossing),
+    )  # fmt: skip
 
 
 def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:

@@ -1,4 +1,4 @@
-"""Section of the report on robust verdicts: changes that turn PASS into FAIL, and verdicts under other models."""
+"""Robust verdicts in the report: changes that turn PASS into FAIL, verdicts under other models, and both in words."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from marsyard.reports.figure_style import MARKERS, MUTED, SERIES, in_page_style,
 from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, sort_key
 from marsyard.reports.section import Block, Grid, Section, svg_figure
 from marsyard.reports.variants import VariantVerdict
-from marsyard.reports.verdicts import Status
-from marsyard.reports.wording import NOTHING, count, note_text, number, percent
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.reports.wording import NOTHING, count, format_fraction, note_text, number, percent
 
 #: Maximum number of rows of the table of a requirement, and of parameters in the figure.
 _MAX_ROWS, _MAX_PARAMETERS = 12, 16
@@ -38,7 +38,10 @@ def robustness_section(records: Sequence[Robustness], variants: Sequence[Variant
     """Create the section; None for a run without a requirement that is met."""
     if not records and not variants:
         return None
-    blocks = [Block(figures=[_figure(records)], note=note_text("common.robustness"))] if records else []
+    blocks = []
+    if records:
+        figure = svg_figure(_draw_changes(records), "robustness", note_text("common.robustness_caption"), wide=True)
+        blocks.append(Block(figures=[figure], note=note_text("common.robustness")))
     for requirement in dict.fromkeys(item.requirement for item in records):
         own = [item for item in records if item.requirement == requirement]
         blocks.append(Block(f"Change to FAIL: {requirement}", grid=change_grid(own)))
@@ -72,9 +75,13 @@ def change_grid(records: Sequence[Robustness]) -> Grid:
 def variant_grid(variants: Sequence[VariantVerdict]) -> tuple[Grid, str]:
     """Create the table of verdicts by variant and requirement; also return the band of each requirement in words."""
     requirements = list(dict.fromkeys(item.requirement for item in variants))
-    by_key = {(item.title, item.requirement): item for item in variants}
+    texts = {
+        (item.title, item.requirement): f"{item.status}: {percent(item.estimate)} "
+        f"({percent(item.lower)} to {percent(item.upper)})"
+        for item in variants
+    }
     rows = [
-        [title, *(_verdict_text(by_key.get((title, name))) for name in requirements)]
+        [title, *(texts.get((title, name), NOTHING) for name in requirements)]
         for title in dict.fromkeys(item.title for item in variants)
     ]
     bands = []
@@ -85,14 +92,8 @@ def variant_grid(variants: Sequence[VariantVerdict]) -> tuple[Grid, str]:
     return Grid(["Model", *requirements], rows), f"{'; '.join(bands)}."
 
 
-def _verdict_text(item: VariantVerdict | None) -> str:
-    if item is None:
-        return NOTHING
-    return f"{item.status}: {percent(item.estimate)} ({percent(item.lower)} to {percent(item.upper)})"
-
-
 @in_page_style
-def _draw(records: Sequence[Robustness]) -> Figure:
+def _draw_changes(records: Sequence[Robustness]) -> Figure:
     """Draw the changes of parameters for each requirement, in assumed spreads; those to FAIL are first."""
     drawn = {(item.parameter, item.value, item.kind, item.requirement): item for item in records}
     ordered = sorted(records, key=lambda item: (item.kind is not ChangeKind.DIVERGENCE, *sort_key(item)))
@@ -121,14 +122,6 @@ def _draw(records: Sequence[Robustness]) -> Figure:
     return figure
 
 
-def _figure(records: Sequence[Robustness]) -> Any:
-    caption = (
-        "Changes of parameters, those to FAIL first. Thick lines: PASS holds. Marks: the estimated rate reaches the "
-        "permitted rate (FAIL). Thin lines end where FAIL is shown, or where the cases say nothing further."
-    )
-    return svg_figure(_draw(records), "robustness", caption, wide=True)
-
-
 def robust_sentences(record: Mapping[str, Any]) -> list[str]:
     """Describe a study `robust` in a record; empty for another run."""
     study = ROBUST.read(record)
@@ -137,3 +130,62 @@ def robust_sentences(record: Mapping[str, Any]) -> list[str]:
     parameters, result = study
     variants = count(len(parameters.variants), "variant")
     return [f"{count(result.cases, 'case')} in {variants}. The report of the run evaluates them."]
+
+
+#: Statements hold for each change, but not for several at once.
+_ONE = "one change at a time"
+#: Maximum number of listed changes to FAIL.
+_MAX_CHANGES = 3
+
+
+def reach_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
+    """Describe the smallest change of one distribution up to which a verdict is met; empty if it is not, or unknown."""
+    changes = [
+        item
+        for item in records
+        if item.requirement == verdict.requirement_id and item.kind not in (ChangeKind.DIVERGENCE, ChangeKind.VALUE)
+    ]
+    # unknown changes (NaN) of an evaluation by rate are larger than those of others
+    known = [item for item in changes if item.lower > 0.0]
+    if not known or not verdict.status.is_met:
+        return ""
+    nearest = min(known, key=lambda item: item.lower)
+    return f"holds up to {number(nearest.lower)} spreads ({nearest.name}, {nearest.kind})"
+
+
+def robustness_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
+    """Describe how far the PASS of a requirement reaches, and the nearest changes to FAIL; empty without records."""
+    own = [item for item in records if item.requirement == verdict.requirement_id]
+    if not own:
+        return ""
+    shifts = [
+        item.lower for item in own if item.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN) and item.lower > 0.0
+    ]
+    factors = [item.lower for item in own if item.kind is ChangeKind.WIDER and item.lower > 0.0]
+    ball = next(item for item in own if item.kind is ChangeKind.DIVERGENCE)
+    ranges = [f"for a shift of any mean by {number(min(shifts))} standard deviations"] if shifts else []
+    ranges += [f"for any standard deviation up to + {percent(min(factors))}"] if factors else []
+    if ball.lower > 0.0:
+        ranges.append(f"for any change of all dispersions up to a divergence of {number(ball.passes_at)} nat")
+    nearest: dict[str, Robustness] = {}
+    for item in sorted(own, key=sort_key):
+        if item.fail_text and item is not ball:
+            nearest.setdefault(item.parameter, item)
+    changes = "; ".join(item.fail_text for item in [*nearest.values()][:_MAX_CHANGES])
+    by_rate = verdict.decide_by == ESTIMATE
+    # a calibration excludes PASS
+    word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
+    confidence = f"{format_fraction(verdict.confidence)} confidence"
+    word = f"Met by the rate (no confidence, {_ONE})" if by_rate else f"{word} ({confidence}, {_ONE})"
+    none = "These cases do not show PASS."
+    if verdict.status.is_met:
+        none = f"The cases are too few to state how far PASS reaches (effective number: {ball.effective_cases:.0f})."
+    reach = f"{word} {', '.join(ranges)}." if ranges else none
+    examined = sum(item.kind not in (ChangeKind.DIVERGENCE, ChangeKind.VALUE) for item in own)
+    by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
+    chance = (
+        f" (of {examined} examined, of which at most {by_chance} appear by chance on average)"
+        if by_chance and changes
+        else ""
+    )
+    return f"{reach} Nearest changes to FAIL{chance}: {changes or 'unknown, because too few cases fail'}."

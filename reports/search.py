@@ -11,7 +11,7 @@ from typing import Any
 from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.results import SEARCH, FoundFailure
 from marsyard.reports.section import Block, Grid, Section, Subject
-from marsyard.reports.wording import NOTHING, count, number
+from marsyard.reports.wording import NOTHING, count, note_text, number
 
 
 def search_sentences(record: Mapping[str, Any]) -> list[str]:
@@ -44,16 +44,12 @@ def failure_sentence(index: int, failure: FoundFailure) -> str:
 
 
 def _list_values(failure: FoundFailure) -> str:
-    return ", ".join(f"{path} = {value_text(value)}" for path, value in failure.values.items())
+    values = {path: number(value) if isinstance(value, float) else value for path, value in failure.values.items()}
+    return ", ".join(f"{path} = {value}" for path, value in values.items())
 
 
 def _margin_text(margin: float) -> str:
     return NOTHING if math.isnan(margin) else number(margin)
-
-
-def value_text(value: object) -> str:
-    """Format a parameter value."""
-    return number(float(value)) if isinstance(value, float) else str(value)
 
 
 def search_section(subject: Subject) -> Section | None:
@@ -75,11 +71,7 @@ def search_section(subject: Subject) -> Section | None:
         for index, failure in enumerate(result.failures, start=1)
     ]
     head = ["", "Parameters", "Margin", "Distance (standard deviations)", "Similar violations", "Repeated", "Case"]
-    note = (
-        "All other parameters are those of the campaign. The distance of the parameters from their medians measures "
-        "how unlikely they are; the most likely violation is the first. Each violation has a campaign file in the "
-        "folder failures, and nightly.toml lists them for nightly runs."
-    )
+    note = note_text("common.search")
     block = Block("Reduced violations", grid=Grid(head, rows), note=note) if rows else Block(text="No violation.")
     data = convert_to_json(asdict(result)) | {"requirement": parameters.requirement}
     return Section("search", "Search", "Search for violations", (block,), data)

@@ -1,7 +1,7 @@
 """Building blocks of report sections: tables, figures with captions, and blocks."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import pandas as pd
@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.figure_style import svg_markup
 from marsyard.reports.stored import StoredRun
+from marsyard.reports.wording import NOTHING
 
 T = TypeVar("T")
 
@@ -120,3 +121,19 @@ def create_section(key: str, name: str, title: str, *blocks: Block | None) -> Se
 def has_values(frame: pd.DataFrame, *columns: str) -> bool:
     """Whether all columns exist and contain a value."""
     return all(name in frame and not frame[name].isna().all() for name in columns)
+
+
+def omit_empty_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Sequence[str]], str]:
+    """Omit the rows that have only dashes; return the other rows and a sentence that names the omitted rows."""
+    is_empty = [all(text == NOTHING for text in row[1:]) for row in rows]
+    names = [row[0].split(" (")[0] for row, empty in zip(rows, is_empty, strict=True) if empty]
+    sentence = f"Too few cases to estimate: {', '.join(names)}. " if names else ""
+    return [row for row, empty in zip(rows, is_empty, strict=True) if not empty], sentence
+
+
+def drop_empty_columns(grid: Grid) -> Grid:
+    """Remove the columns after the first that contain only dashes."""
+    kept = [0, *(index for index in range(1, len(grid.head)) if any(row[index] != NOTHING for row in grid.rows))]
+    return replace(
+        grid, head=[grid.head[index] for index in kept], rows=[[row[index] for index in kept] for row in grid.rows]
+    )

@@ -2,8 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +65,8 @@ class StoredRun:
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        return _read_requirements(self.record)
+        stored = self.recorded("requirements")
+        return [item for item in stored if isinstance(item, Mapping)] if isinstance(stored, list | tuple) else []
 
     @property
     def dispersed_paths(self) -> tuple[str, ...]:
@@ -78,7 +78,10 @@ class StoredRun:
 
         A scenario without declared columns has the conditions that their names suggest.
         """
-        return _is_condition(self.record, name)
+        if any(name == path or name.startswith(f"{path}.") for path in self.dispersed_paths):
+            return True
+        columns = read_columns(str(self.recorded("scenario") or ""))
+        return looks_like_condition(name) if columns is None else columns.is_condition(name)
 
     def driver_columns(self, metric: str, max_columns: int = 6) -> list[str]:
         """Select conditions that may affect a metric; see `marsyard.reports.column_selection.driver_columns`."""
@@ -135,15 +138,15 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     record["requirements"] = definition.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
-    with report_damage(path, StoreError, "cannot be read"):
-        rows, all_rows = _read_rows(path, record)
     try:
         case_folders = [entry.name for entry in (directory / "cases").iterdir() if (entry / "products.json").is_file()]
     except OSError:
         case_folders = []
     stored_cases = sorted(int(name) for name in case_folders if name.isascii() and name.isdigit())
     stored_cases.sort(key=lambda case: case != record.get("showcase"))
-    return StoredRun(directory, rows, all_rows, record, tuple(stored_cases), unverified)
+    empty = StoredRun(directory, pd.DataFrame(), pd.DataFrame(), record, tuple(stored_cases), unverified)
+    with report_damage(path, StoreError, "cannot be read"):
+        return _read_rows(path, empty)
 
 
 def read_cases(directory: Path, cases: Sequence[int]) -> dict[int, dict[str, str]]:
@@ -156,46 +159,29 @@ def read_cases(directory: Path, cases: Sequence[int]) -> dict[int, dict[str, str
     return {row["case"]: {name: str(value) for name, value in row.items()} for row in rows}
 
 
-def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read `frame` and `all_cases` of `StoredRun`; both are one table if there are at most `MAX_FULL_CASES` cases."""
+def _read_rows(path: Path, run: StoredRun) -> StoredRun:
+    """Add the rows to a run; `frame` and `all_cases` are one table if there are at most `MAX_FULL_CASES` cases."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
     stored_names = file.schema_arrow.names
     if file.metadata.num_rows <= MAX_FULL_CASES:
         frame = _sort_rows(pd.read_parquet(path))
-        return frame, frame
+        return replace(run, frame=frame, all_cases=frame)
     first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
-    requirements = _read_requirements(record)
+    run = replace(run, frame=first_rows)
     # columns of all cases that verdicts, outcomes and figures use
     columns = {"case", "outcome", "answered", "terrain", "error", "traceback"}
     columns.update(column.name for column in enabling_columns(stored_names))
-    for requirement in requirements:
+    for requirement in run.requirements:
         columns.update(
             str(requirement.get("metric", "")).split(" + "), str(requirement.get("population", "")).split(" and ")
         )
-    metric = primary_metric(first_rows, requirements)
+    metric = primary_metric(first_rows, run.requirements)
     if metric is not None:
-        drivers = driver_columns(first_rows, metric, max_columns=3, is_condition=partial(_is_condition, record))
-        columns.update([metric, *axis_columns(metric, stored_names), *drivers])
+        columns.update([metric, *axis_columns(metric, stored_names), *run.driver_columns(metric, max_columns=3)])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
-    return _sort_rows(first_rows), _sort_rows(all_cases)
-
-
-def _read_requirements(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the requirements of a record or of its definition; empty if they are invalid."""
-    stored = record.get("requirements")
-    stored = table(record.get("definition")).get("requirements") if stored is None else stored
-    return [item for item in stored if isinstance(item, Mapping)] if isinstance(stored, list | tuple) else []
-
-
-def _is_condition(record: Mapping[str, Any], name: str) -> bool:
-    definition = table(record.get("definition"))
-    paths = table(record.get("dispersions") or definition.get("dispersions"))
-    if any(name == path or name.startswith(f"{path}.") for path in paths):
-        return True
-    columns = read_columns(str(record.get("scenario") or definition.get("scenario") or ""))
-    return looks_like_condition(name) if columns is None else columns.is_condition(name)
+    return replace(run, frame=_sort_rows(first_rows), all_cases=_sort_rows(all_cases))
 
 
 def read_columns(scenario: str) -> Columns | None:

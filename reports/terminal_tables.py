@@ -11,9 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from marsyard.campaigns.definition.claims import Confirmation
-from marsyard.reports.requirement_wording import requirement_text
 from marsyard.reports.verdicts import Status, Verdict
-from marsyard.reports.wording import NOTHING, percent
+from marsyard.reports.wording import NOTHING, percent, requirement_text
 
 _STYLES = {
     Status.PASS: "bold green",

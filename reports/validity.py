@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
+from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.validation_rows import (
     QUANTITIES,
@@ -26,7 +27,7 @@ from marsyard.reports.validation_rows import (
     merge_ranges,
     rows_of_system,
 )
-from marsyard.reports.wording import count, percent
+from marsyard.reports.wording import NOTHING, count, note_text, percent
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import System, find_system
 
@@ -193,3 +194,27 @@ def _read_preset(system: System, site: str, path: Sequence[str]) -> Any:
     for name in path:
         value = getattr(value, name, None)
     return value
+
+
+def validity_section(subject: Subject) -> Section | None:
+    """Create the section with the domain of validity; None for the system of another package."""
+    validity = assess_validity(subject.run)
+    if not validity.domains:
+        return None
+    rows = [
+        [
+            f"{QUANTITIES[item.quantity]}, compared {DOMAINS[domain.kind][1]}",
+            format_range(item.cases),
+            NOTHING if item.checked is None else format_range(item.checked),
+            f"{item.outside:,} ({percent(item.outside / validity.cases)})",
+        ]
+        for domain in validity.domains
+        for item in domain.coverage
+    ]
+    grid = Grid(["Quantity", "Cases", "Checked", "Cases outside"], rows)
+    missed = Grid(
+        ["Missed check", "Kind", "Conditions"], [[item.text, item.kind, item.conditions] for item in validity.missed]
+    )
+    blocks = [Block(grid=grid, note=note_text("common.validity"))]
+    blocks += [Block(heading="Checks that miss their limit", grid=missed)] if validity.missed else []
+    return Section("validity", "Validity", "Conditions in which the simulation was checked", blocks)

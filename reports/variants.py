@@ -1,14 +1,13 @@
 """Verdicts under other parameters than those of a campaign, from the studies `robust` in the folder of its run.
 
 A study repeats cases of the run in variants (`marsyard.campaigns.studies.robust`). A case represents several cases of
-the run, so that its failures have this weight (`marsyard.reports.statistics.weighted`). Between the steps of a
+the run, so that its failures have this weight (`marsyard.reports.statistics.reweighted_rates`). Between the steps of a
 parameter, the margin of each case is interpolated.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,8 +23,7 @@ from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.robustness import ChangeOutcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.crossing import find_crossing
-from marsyard.reports.statistics.weighted import weighted_rates
+from marsyard.reports.statistics.reweighted_rates import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.columns import split_unit
@@ -105,7 +103,9 @@ def evaluate_variants(studies: Sequence[RobustStudy], verdicts: Sequence[Verdict
 def _evaluate(
     study: RobustStudy, variant: RobustVariant, frame: pd.DataFrame, verdict: Verdict
 ) -> VariantVerdict | None:
-    evidence = collect_evidence(frame, _to_requirement(verdict), INDEPENDENT, has_own_terrains=True)
+    names = ("metric", "bound", "probability", "confidence", "population", "scale")
+    requirement = {"id": verdict.requirement_id} | {name: getattr(verdict, name) for name in names}
+    evidence = collect_evidence(frame, requirement, INDEPENDENT, has_own_terrains=True)
     if evidence is None or not evidence.with_unfinished.n:
         return None
     member, success = evidence.with_unfinished.member, evidence.with_unfinished.success
@@ -144,11 +144,6 @@ def _widen(
     equal = weighted_rates(np.ones((1, groups.size)), ~success, groups, confidences)
     lower, upper = exact.min_failure_rate(1.0 - confidences[0]), exact.max_failure_rate(1.0 - confidences[1])
     return min(lower / max(float(equal.lower[0]), _TINY), 1.0), max(upper / float(equal.upper[0]), 1.0)
-
-
-def _to_requirement(verdict: Verdict) -> Mapping[str, Any]:
-    names = ("metric", "bound", "probability", "confidence", "population", "scale")
-    return {"id": verdict.requirement_id} | {name: getattr(verdict, name) for name in names}
 
 
 def _groups(frame: pd.DataFrame, member: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " m"] | None:

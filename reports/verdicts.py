@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from marsyard.campaigns.json_numbers import Number
-from marsyard.reports.requirement_wording import population_text
 from marsyard.reports.statistics.clustered_cases import TerrainEvidence
-from marsyard.reports.wording import count, format_fraction, percent
+from marsyard.reports.wording import count, format_fraction, percent, population_text
 
 #: Beginning of the statement of a requirement whose population the flight system cannot know.
 GIVEN_TRUTH = "Given truth"

@@ -12,7 +12,7 @@ from typing import Any
 
 from marsyard.algorithms import exchange
 from marsyard.scenarios.imports import import_object, source_files
-from marsyard.scenarios.isolation.remote_description import AlgorithmDescription, describe_in_process
+from marsyard.scenarios.isolation.remote import AlgorithmDescription, describe_in_process
 from marsyard.scenarios.offline_algorithms import is_offline
 from marsyard.scenarios.systems import systems
 
@@ -42,7 +42,10 @@ def describe_custom(spec: str, shipped: Collection[str] = ()) -> AlgorithmDescri
     try:
         return describe_in_process(path)
     except ImportError as error:
-        raise ValueError(_import_problem(spec, path, error)) from error
+        problem = (
+            f"cannot import algorithm '{spec}'" if spec == path else f"algorithm '{spec}' cannot be loaded from {path}"
+        )
+        raise ValueError(f"{problem}: {error}") from error
 
 
 def import_algorithm(path: str) -> Any:
@@ -51,12 +54,6 @@ def import_algorithm(path: str) -> Any:
         return import_object(path)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"cannot import algorithm '{path}': {error}") from error
-
-
-def _import_problem(spec: str, path: str, error: Exception) -> str:
-    if spec == path:
-        return f"cannot import algorithm '{spec}': {error}"
-    return f"algorithm '{spec}' cannot be loaded from {path}: {error}"
 
 
 @cache

@@ -18,11 +18,10 @@ from typing import Any, Generic, TypeVar, cast
 
 from marsyard.algorithms import exchange
 from marsyard.algorithms.worker_device import worker_device
-from marsyard.scenarios.answer_tables import AnswerFormat, read_answers
 from marsyard.scenarios.custom_algorithms import custom_path, describe_custom, import_algorithm
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import RemoteAlgorithm
-from marsyard.scenarios.offline_algorithms import answers_file, create_offline, is_offline
+from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 
 Algorithm = TypeVar("Algorithm")

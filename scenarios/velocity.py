@@ -10,16 +10,14 @@ from dataclasses import replace
 from marsyard.algorithms import exchange
 from marsyard.algorithms.answers import check_and_set_span
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes.binning import check_binning
-from marsyard.algorithms.dimes.homography import HomographyEstimator
+from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes.options import IMPROVEMENTS
-from marsyard.algorithms.dimes.phase_correlation import PhaseCorrelationEstimator
+from marsyard.algorithms.dimes.views import check_binning
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
-from marsyard.scenarios.answer_tables import AnswerFormat
-from marsyard.scenarios.offline_algorithms import CaseExporter, RecordedAnswer
+from marsyard.scenarios.offline_algorithms import AnswerFormat, CaseExporter, RecordedAnswer
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.scenarios.tasks import Task, variants
 from marsyard.sim.measurements import DescentMeasurements

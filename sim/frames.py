@@ -12,7 +12,7 @@ Transforms are SciPy's `RigidTransform` and `Rotation`. Their names contain the 
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
 #: Rotation from world axes (east, north, up) to site axes (north, east, down); it is equal to its inverse.
@@ -20,6 +20,8 @@ SITE_FROM_WORLD = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0
 
 #: Equatorial and polar radius of Mars, metres (Archinal et al. 2018, table 4).
 MARS_RADII_M = (3_396_190.0, 3_376_200.0)
+
+Quaternions = Float64[np.ndarray, "n 4"]  #: Unit quaternions in the order x, y, z, w.
 
 
 def world_from_mars_fixed(origin_m: Float[np.ndarray, "3"]) -> RigidTransform:
@@ -72,3 +74,29 @@ def direction(azimuth_rad: float, elevation_rad: float) -> Float[np.ndarray, "3"
     horizontal = np.cos(elevation_rad)
     east, north = horizontal * np.sin(azimuth_rad), horizontal * np.cos(azimuth_rad)
     return np.array([east, north, np.sin(elevation_rad)], dtype=np.float64)
+
+
+def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
+    """Multiply quaternions (x, y, z, w) pairwise, faster than `Rotation`; the right rotation is applied first."""
+    ax, ay, az, aw = left.T
+    bx, by, bz, bw = right.T
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by + ay * bw + az * bx - ax * bz
+    z = aw * bz + az * bw + ax * by - ay * bx
+    return np.stack([x, y, z, aw * bw - ax * bx - ay * by - az * bz], axis=1)
+
+
+def accumulate_quaternions(steps: Quaternions) -> Quaternions:
+    """Compute the products of the first 1, 2, ... n quaternions; each step multiplies from the right.
+
+    Recursion: the cumulative products of pairs are every second result; the others require one more product each.
+    """
+    count = len(steps)
+    if count == 1:
+        return steps
+    pair_products = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
+    cumulative = np.empty((count, 4))
+    cumulative[0] = steps[0]
+    cumulative[1::2] = pair_products
+    cumulative[2::2] = multiply_quaternions(pair_products[: (count - 1) // 2], steps[2::2])
+    return cumulative

@@ -1,10 +1,8 @@
 """DIMES: horizontal velocity from three descent images ("Field Testing of the MER DIMES", section II)."""
 
-from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
-from marsyard.algorithms.dimes.estimator import DimesEstimator
+from marsyard.algorithms.dimes.estimator import DimesEstimator, propagate_velocity
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.products import dimes_products
-from marsyard.algorithms.dimes.propagation import propagate_velocity
+from marsyard.algorithms.dimes.products import DimesDetails, DimesTrack, PairDetails, dimes_products
 from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 

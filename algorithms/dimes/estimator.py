@@ -11,14 +11,13 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
-from marsyard.algorithms.dimes.ground_tracks import track_grid
-from marsyard.algorithms.dimes.ground_view import pixels_from_ground
+from marsyard.algorithms.dimes.ground_view import pixels_from_ground, zero_phase_pixel
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.products import DimesDetails, DimesTrack, PairDetails
 from marsyard.algorithms.dimes.rectification import rectify_patch
+from marsyard.algorithms.dimes.tilt import track_grid
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.dimes.views import BinnedView, build_views
-from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
 from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.peaks import Peak, biquadratic_offset, highest_peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -168,3 +167,14 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
     if apparent_m_s < options.imu_threshold_m_s:
         return replace(answer, details=details)
     return VelocityEstimate(VelocityOutcome.INCLINED_GROUND, None, details)
+
+
+def propagate_velocity(
+    velocity_m_s: Vector2, inertial_at_estimate_m_s: Vector2, inertial_at_end_m_s: Vector2
+) -> Vector2:
+    """Propagate a horizontal velocity by the IMU, m/s, as to the firing of the thrusters near 100 m (section I).
+
+    `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
+    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error common to both has no effect.
+    """
+    return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

@@ -1,6 +1,6 @@
 """Template candidates in the overlap region of two views, and their selection (section II.A).
 
-Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot (`zero_phase`) is masked.
+Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot (`ground_view`) is masked.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,6 @@ from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import ground_view, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView
-from marsyard.algorithms.dimes.zero_phase import outside_zero_phase
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
 #: Lower limit of the mean signal before division, as a fraction of the full scale.
@@ -106,7 +105,7 @@ def overlap_width_m(
         # vertices in 1/16 of a cell
         vertices = np.rint(16.0 * (outline - low) / gsd_m).astype(np.int32)
         overlap &= cv2.fillPoly(np.zeros_like(overlap), [vertices], (1,), shift=4).astype(np.uint8)
-        overlap &= outside_zero_phase(view, ground, sun_direction, options.zero_phase_radius_rad)
+        overlap &= ground_view.outside_zero_phase(view, ground, sun_direction, options.zero_phase_radius_rad)
     # cells outside the grid belong to the ground outside the overlap
     distances = cv2.distanceTransform(np.pad(overlap, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return 2.0 * gsd_m * float(distances.max())
@@ -155,7 +154,7 @@ def template_candidates(
 
     def is_outside_spot(view: BinnedView, half_m: float, per_side: int) -> Flags:
         points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
-        outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
+        outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
     valid = is_outside_spot(first, geometry.template_half_m, 4) & is_outside_spot(second, geometry.template_half_m, 4)

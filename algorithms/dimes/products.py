@@ -1,16 +1,94 @@
-"""Conversion of DIMES' intermediate products to plain arrays, for storage and figures.
+"""Intermediate products of DIMES, and their conversion to plain arrays for storage and figures.
 
 Figures are those of Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.details import DimesDetails, PairDetails
 from marsyard.algorithms.dimes.ground_view import ground_from_pixels, pixels_from_ground
-from marsyard.algorithms.dimes.validity import ValidityCheck
+from marsyard.algorithms.dimes.tilt import GroundFit
+from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
+from marsyard.algorithms.dimes.views import BinnedView
+
+
+@dataclass(frozen=True)
+class DimesTrack:
+    """Template tracked from the earlier to the later image of a pair.
+
+    - pair, index: Pair (0: images 1 and 2; 1: images 2 and 3) and number of the template in it, best contrast first
+    - template_pixel: Template centre, (u, v) in the earlier binned image
+    - match_pixel: Matched template centre, (u, v) in the later binned image; NaN if outside the camera's view
+    - ground_m: Template centre on the ground, (east, north) of the earlier nadir point. The window's centre has the
+      same offset from the later nadir point.
+    - template, window: Rectified and corrected patches, counts, north up
+    - match: Row and column in `window` of the matched template's centre
+    - surface: Correlation at every shift; its centre is zero motion. It is -1 where the later image does not show the
+      complete template.
+    - failed: Validity checks that the track failed
+    - velocity_m_s: Mean velocity of the camera over the pair (east, north); also given for invalid tracks
+    """
+
+    pair: int
+    index: int
+    template_pixel: Float[np.ndarray, "2"]
+    match_pixel: Float[np.ndarray, "2"]
+    ground_m: Float[np.ndarray, "2"]
+    template: Float[np.ndarray, "n n"]
+    window: Float[np.ndarray, "w w"]
+    match: Float[np.ndarray, "2"]
+    surface: Float[np.ndarray, "s s"]
+    metrics: TrackMetrics
+    failed: tuple[ValidityCheck, ...]
+    velocity_m_s: Float[np.ndarray, "2"]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every check passed."""
+        return not self.failed
+
+
+@dataclass(frozen=True)
+class PairDetails:
+    """Intermediate products of one pair of consecutive images.
+
+    - overlap_polygon: Outline (u, v) in the earlier image of the later image's footprint at zero horizontal motion
+    - zero_phase_pixels: Anti-solar point (zero phase angle) in both images (u, v); NaN if invisible
+    - gsd_m: Ground sample distance of rectified pixels
+    - tracks: All tracks, valid or not
+    - views: Earlier and later binned image
+    """
+
+    overlap_polygon: Float[np.ndarray, "n 2"]
+    zero_phase_pixels: Float[np.ndarray, "2 2"]
+    gsd_m: float
+    tracks: tuple[DimesTrack, ...]
+    views: tuple[BinnedView, BinnedView]
+
+
+@dataclass(frozen=True)
+class DimesDetails:
+    """Intermediate products of `DimesEstimator`, returned as `VelocityEstimate.details`.
+
+    - pairs: Both pairs of images; empty for unusable times, altitudes or attitudes
+    - combinations: All combinations of valid tracks, best agreement with the IMU first
+    - selected: The combination of the reported velocity, or None
+    - ground: Fit of ground and motion that corrects the velocity for the common tilt; None without this correction
+    """
+
+    pairs: tuple[PairDetails, ...]
+    combinations: tuple[Combination, ...]
+    selected: Combination | None
+    ground: GroundFit | None = None
+
+    @property
+    def tracks(self) -> tuple[DimesTrack, ...]:
+        """The tracks of both pairs."""
+        return tuple(track for pair in self.pairs for track in pair.tracks)
+
 
 #: Columns of the stored array `tracks`.
 TRACK_COLUMNS = (
@@ -26,20 +104,12 @@ FOOTPRINT_POINTS = 17
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
 
 
-class RectifiedLattice(NamedTuple):
-    """Sampling lattice of the virtual camera's image of a pair, for Figs. 7-9; rows run south.
+def rectified_lattice(pair: PairDetails) -> tuple[Float[np.ndarray, "3"], list[Float[np.ndarray, "n n 2"]]]:
+    """Build the lattice that samples the virtual camera's image of a pair over both footprints, for Figs. 7-9.
 
-    - frame_m: (east, north, step), metres: the upper left point relative to the nadir point, and the spacing
-    - earlier_pixels, later_pixels: pixels (u, v) of both images at the lattice points; NaN if invisible
+    Returns (east, north, step), metres: the upper left point relative to the nadir point, and the spacing; and the
+    pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible. Rows run south.
     """
-
-    frame_m: Float[np.ndarray, "3"]
-    earlier_pixels: Float[np.ndarray, "n n 2"]
-    later_pixels: Float[np.ndarray, "n n 2"]
-
-
-def rectified_lattice(pair: PairDetails) -> RectifiedLattice:
-    """Build the sampling lattice of a pair over the footprints of both images."""
     footprints = []  # ground points of a lattice of pixels of each image
     for view in pair.views:
         u, v = np.meshgrid(*(np.linspace(0.0, 1.0, FOOTPRINT_POINTS) * (size - 1.0) for size in view.size))
@@ -54,7 +124,7 @@ def rectified_lattice(pair: PairDetails) -> RectifiedLattice:
     for view in pair.views:
         view_pixels, visible = pixels_from_ground(view, ground)
         pixels.append(np.where(visible[..., None], view_pixels, np.nan))
-    return RectifiedLattice(np.array([ground[0, 0, 0], ground[0, 0, 1], step]), *pixels)
+    return np.array([ground[0, 0, 0], ground[0, 0, 1], step]), pixels
 
 
 def dimes_products(details: DimesDetails) -> dict[str, Any]:
@@ -90,7 +160,7 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         products[f"overlap_{number}"] = pair.overlap_polygon
         products[f"zero_phase_{number}"] = pair.zero_phase_pixels
         products[f"gsd_{number}"] = np.array([pair.gsd_m])
-        frame, *lattices = rectified_lattice(pair)
+        frame, lattices = rectified_lattice(pair)
         products[f"rectified_frame_{number}"] = frame
         for side, pixels in enumerate(lattices):
             products[f"rectified_{number}_{side}"] = pixels

@@ -1,6 +1,5 @@
 """External programs as algorithms under test: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
-from marsyard.algorithms.exchange.command import PREFIXES, Command, parse_command
 from marsyard.algorithms.exchange.executable import (
     SITE_REQUESTS,
     VELOCITY_REQUESTS,
@@ -12,12 +11,16 @@ from marsyard.algorithms.exchange.files import (
     ImageFormat,
     read_case,
     read_frame,
+    read_mast,
+    read_pose,
+    read_stop,
+    read_target,
     write_case,
     write_frame,
 )
 from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerForm, ProgramDetails, answer_time_s
 from marsyard.algorithms.exchange.limits import ExecutableLimits
-from marsyard.algorithms.exchange.rover_files import read_mast, read_pose, read_stop, read_target
+from marsyard.algorithms.exchange.serving import PREFIXES, Command, parse_command
 from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
 __all__ = [

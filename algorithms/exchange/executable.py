@@ -11,8 +11,7 @@ from typing import Any
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.answers import check_aim, check_update
-from marsyard.algorithms.exchange.command import Command
-from marsyard.algorithms.exchange.files import write_case
+from marsyard.algorithms.exchange.files import encode_rover_pose, write_case, write_mast, write_stop
 from marsyard.algorithms.exchange.forms import (
     SITE_FORM,
     VELOCITY_FORM,
@@ -24,8 +23,7 @@ from marsyard.algorithms.exchange.forms import (
 )
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS
-from marsyard.algorithms.exchange.rover_files import encode_rover_pose, write_mast, write_stop
-from marsyard.algorithms.exchange.serving import KeptFolder, Session, run_once
+from marsyard.algorithms.exchange.serving import Command, KeptFolder, Session, run_once
 from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, bad_answer
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements

@@ -18,12 +18,32 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from marsyard.algorithms.awake_clock import AwakeClock
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.sandbox import sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.processes import descendants, end_with_parent, kill, resident_bytes
 from marsyard.algorithms.worker_device import worker_device
+
+#: Maximum time between two readings of an `AwakeClock` that is counted, s.
+_MAX_STEP_S = 1.0
+
+
+class AwakeClock:
+    """Clock that counts only the time during which this process reads it at least once a second.
+
+    If this process is suspended, together with the process that it monitors, the time of the suspension is not counted.
+    """
+
+    def __init__(self) -> None:
+        self._elapsed_s, self._last_s = 0.0, time.monotonic()
+
+    def elapsed_s(self) -> float:
+        """Return the counted time since the creation of the clock."""
+        now_s = time.monotonic()
+        self._elapsed_s += min(now_s - self._last_s, _MAX_STEP_S)
+        self._last_s = now_s
+        return self._elapsed_s
+
 
 #: Interval of the checks of time, memory and output, and of the files' size, seconds.
 _POLL_S, _FILES_POLL_S = 0.02, 0.5

@@ -1,13 +1,29 @@
-"""Elevation map of a landing site from points of the ground (section II.D), and filling of its small holes."""
+"""Elevation map of a landing site from points of the ground (section II.D), its small holes, and distances in a map."""
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Num
 
-from marsyard.algorithms.arrays import Points3, Raster, Vector2
-from marsyard.algorithms.hda.kernels import elevation as kernels
-from marsyard.algorithms.hda.morphology import dilate, grassfire
+from marsyard.algorithms.arrays import Mask, Points2, Points3, Raster, Vector, Vector2
+
+
+def grassfire(mask: Mask) -> Raster:
+    """Grassfire transform (Blum 1973): distance of every cell to the nearest true cell of a mask, in cells.
+
+    Infinite if no cell is true.
+    """
+    if not np.any(mask):
+        return np.full(mask.shape, np.inf)
+    distances = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distances.astype(np.float64))
+
+
+def dilate(mask: Mask, radius_cells: float) -> Mask:
+    """Dilate a mask by a disc: a cell becomes true within `radius_cells` of a true cell."""
+    return np.asarray(mask | (grassfire(mask) <= radius_cells))
+
 
 #: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
 MIN_WEIGHT = 0.1
@@ -51,10 +67,27 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     columns, rows = (int(count) for count in np.ceil(extent / cell))
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
     empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
-    row, column = empty.cells(points[:, :2]).T
-    sums, weights = kernels.accumulate_bilinear(row, column, points[:, 2], (rows, columns))
+    sums, weights = _accumulate_bilinear(empty.cells(points[:, :2]), points[:, 2], (rows, columns))
     values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
     return ElevationMap(values, corner, cell)
+
+
+def _accumulate_bilinear(cells: Points2, values: Vector, shape: tuple[int, int]) -> tuple[Raster, Raster]:
+    """Distribute values at fractional cells (row, column) to the four nearest cells with bilinear weights.
+
+    Returns the sums of weighted values and of weights per cell.
+    """
+    low = np.floor(cells).astype(np.int64)
+    fractions = cells - low
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    near = low[:, np.newaxis] + corners
+    weights = np.where(corners == 1, fractions[:, np.newaxis], 1.0 - fractions[:, np.newaxis]).prod(axis=2)
+    inside = np.all((near >= 0) & (near < shape), axis=2)
+    rows, columns = near[inside].T
+    sums = np.zeros((2, *shape))
+    np.add.at(sums[0], (rows, columns), (weights * values[:, np.newaxis])[inside])
+    np.add.at(sums[1], (rows, columns), weights[inside])
+    return sums[0], sums[1]
 
 
 def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:

@@ -10,14 +10,21 @@ from typing import final
 import numpy as np
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
-from marsyard.algorithms.hda import footprints, hazards
-from marsyard.algorithms.hda.details import HdaDetails, MappedGround
+from marsyard.algorithms.hda import hazards
 from marsyard.algorithms.hda.elevation import elevation_map, fill_small_holes
 from marsyard.algorithms.hda.motion import CameraMotion, MotionStart, estimate_motion, plane_depths, range_starts
 from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
-from marsyard.algorithms.hda.scene import LandingScene, build_scene, points_at_depth, undistort
+from marsyard.algorithms.hda.products import HdaDetails, MappedGround
+from marsyard.algorithms.hda.scene import (
+    LandingScene,
+    build_scene,
+    points_at_depth,
+    surface_from_camera,
+    undistort,
+    up_direction,
+    world_from_surface,
+)
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
-from marsyard.algorithms.hda.surface_frame import surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features, window_half_px
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.sim.measurements import LandingMeasurements
@@ -82,7 +89,7 @@ def find_site(
     details = details.end_stage(matches=matches)
     if len(matches.points) < options.min_points:
         return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
-    resolution = footprints.map_resolution(motion, scene.views[0].focal_px, options)
+    resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
         return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
@@ -142,7 +149,7 @@ def match_structure(scene: LandingScene, motion: CameraMotion, options: HdaOptio
 
 
 def map_ground(
-    scene: LandingScene, points_camera: Points3, resolution: footprints.Resolution, options: HdaOptions
+    scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
 ) -> MappedGround | None:
     """Compute the maps of `points_camera` (first camera's frame), and the site; None if the points cover no area."""
     first = scene.views[0]
@@ -155,7 +162,7 @@ def map_ground(
     elevation = fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
     maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
-        maps = replace(maps, safety=footprints.classify_footprints(elevation, resolution, options))
+        maps = replace(maps, safety=hazards.classify_footprints(elevation, resolution, options))
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])

@@ -42,7 +42,7 @@ class HdaOptions:
       I: 11 x 11)
     - window_half_px: Half width w of the search window of a feature. None: the expected displacement of the features
       (section II.A), which the limits of the image pairs and the camera determine
-      (`marsyard.algorithms.hda.tracking.expected_shift_px`). The example of Table I, 81 x 81 px, is 40.
+      (`marsyard.algorithms.hda.tracking.window_half_px`). The example of Table I, 81 x 81 px, is 40.
     - max_baseline_fraction: Limit of the image pairs: baseline divided by range
     - max_tilt_change_rad, max_roll_change_rad, max_height_change_fraction: Limits of the image pairs: rotation about an
       axis in the image plane and about the optical axis, and change of height divided by height. The defaults are those
@@ -93,7 +93,7 @@ class HdaOptions:
       map, in lander diameters. The paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller
       distance, part of the lander would be on unmapped ground.
     - check_footprints: Whether the safe landing map is that of a plane fitted to the footprint at each cell, with a
-      margin for the map's resolution (`marsyard.algorithms.hda.footprints.classify_footprints`). The paper interpolates
+      margin for the map's resolution (`marsyard.algorithms.hda.hazards.classify_footprints`). The paper interpolates
       planes and slopes between fixed squares, and enlarges hazards by the lander's diameter. Over curved ground the
       distance from this interpolated surface is half of the distance from a plane.
     - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths

@@ -37,7 +37,6 @@ class Matches:
     - first: Pixels (u, v) of the first image whose epipolar segment lies inside the second image
     - starts, ends: End points (u, v) of the segments, at the smallest and the largest depth
     - second: Matched pixels (u, v) of the second image
-    - correlations: Eq. 3 at the match
     - depths: Triangulated depths in the first camera's frame, metres
     - statuses: Values of `MatchStatus`
     - points: Points of the accepted matches in the first camera's frame, metres
@@ -47,7 +46,6 @@ class Matches:
     starts: Points2
     ends: Points2
     second: Points2
-    correlations: Float[np.ndarray, "n"]
     depths: Float[np.ndarray, "n"]
     statuses: UInt8[np.ndarray, "n"]
     points: Float[np.ndarray, "m 3"]
@@ -167,7 +165,7 @@ def match_pixels(
         rotation = second_from_first.rotation * pair_motion.rotation.inv()
         rays = rotation.apply(np.column_stack([second_coordinates, np.ones(len(second_coordinates))]))
         matched_pixels = views[1].camera.project(rays)[0]
-    return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)
+    return Matches(pixels, starts, ends, matched_pixels, depths, statuses, points)
 
 
 def forward_backward_error(

@@ -53,19 +53,17 @@ def level_sizes(template_half: int, window_half: int, size: tuple[int, int]) -> 
     return tuple(LevelSize(template, window) for template, window in zip(templates, windows, strict=False))
 
 
-def feature_border_px(options: HdaOptions) -> int:
-    """Minimum distance of features from the image border, pixels: the template fits with a margin of 1 px."""
-    return options.template_half_px + 1
+def window_half_px(view: CameraView, options: HdaOptions) -> int:
+    """Half width w of the search window (Eqs. 4 and 5), whole pixels: the option of this name, or the expected shift.
 
-
-def expected_shift_px(view: CameraView, options: HdaOptions) -> int:
-    """Largest expected displacement of a feature from the start of its search, whole pixels: w of Eqs. 4 and 5.
-
-    It is the displacement of level ground on the optical axis by translation and tilt, plus that of an image corner by
-    rotation about the optical axis and by the magnification of a descent; at most the longer side of the image.
+    The expected shift is the largest displacement of a feature from the start of its search: that of level ground on
+    the optical axis by translation and tilt, plus that of an image corner by rotation about the optical axis and by the
+    magnification of a descent; at most the longer side of the image.
     A start from the poses (option `track_seed`) leaves the parallax of ground that is higher than level ground by the
     fraction `depth_margin` of the range.
     """
+    if options.window_half_px is not None:
+        return options.window_half_px
     columns, rows = view.camera.size
     if options.track_seed is TrackSeed.POSE:
         nearest = 1.0 / (1.0 - options.depth_margin)
@@ -76,11 +74,6 @@ def expected_shift_px(view: CameraView, options: HdaOptions) -> int:
         corner = magnification - 1.0 + 2.0 * np.sin(0.5 * options.max_roll_change_rad)
         shift_px = float(axis_px + 0.5 * np.hypot(columns, rows) * corner)
     return int(np.clip(np.ceil(shift_px), MIN_HALF_PX, max(columns, rows)))
-
-
-def window_half_px(view: CameraView, options: HdaOptions) -> int:
-    """Half width of the search window: the option of this name, by default the expected displacement."""
-    return expected_shift_px(view, options) if options.window_half_px is None else options.window_half_px
 
 
 def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
@@ -105,10 +98,10 @@ def eigenvalue_test(image: Raster, support: int, min_eigenvalue: float) -> Raste
 def select_features(counts: Counts, options: HdaOptions) -> Points2:
     """Select the feature of highest interest in each block of the image; return pixels (u, v), block rows first.
 
-    Blocks without a feature are omitted. Features have at least the distance `feature_border_px` from the border.
+    Blocks without a feature are omitted. The template of a feature fits into the image with a margin of 1 px.
     """
     interest = eigenvalue_test(counts.astype(np.float32), 2 * options.template_half_px + 1, options.min_eigenvalue)
-    border = feature_border_px(options)
+    border = options.template_half_px + 1
     interest[:border] = interest[-border:] = -np.inf
     interest[:, :border] = interest[:, -border:] = -np.inf
     side = options.block_px

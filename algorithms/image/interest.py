@@ -1,30 +1,23 @@
 """Interest operators for the selection of templates and features: structure tensor and Harris interest."""
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-
-class StructureTensor(NamedTuple):
-    """Means of the products g_u g_u, g_v g_v and g_u g_v of the image gradient, squared counts per squared pixel."""
-
-    uu: Float[np.ndarray, "rows columns"]
-    vv: Float[np.ndarray, "rows columns"]
-    uv: Float[np.ndarray, "rows columns"]
+from marsyard.algorithms.arrays import Raster
 
 
-def structure_tensor(image: Float[np.ndarray, "rows columns"], support: int) -> StructureTensor:
+def structure_tensor(image: Raster, support: int) -> tuple[Raster, Raster, Raster]:
     """Mean products of the image gradients over a square of side `support` (pixels) around every pixel.
 
-    The Sobel gradient is scaled to 1 for a ramp of one count per pixel; image borders are mirrored.
+    Returns the means of g_u g_u, g_v g_v and g_u g_v for the gradient g, squared counts per squared pixel. The Sobel
+    gradient is scaled to 1 for a ramp of one count per pixel; image borders are mirrored.
     """
     values = image.astype(np.float32, copy=False)
     gradient_u = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     gradient_v = cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     size = (support, support)
-    return StructureTensor(
+    return (
         np.asarray(cv2.sqrBoxFilter(gradient_u, cv2.CV_32F, size)),
         np.asarray(cv2.sqrBoxFilter(gradient_v, cv2.CV_32F, size)),
         np.asarray(cv2.boxFilter(gradient_u * gradient_v, cv2.CV_32F, size)),

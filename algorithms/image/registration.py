@@ -15,7 +15,6 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Patch, Raster, Vector2
-from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
 #: Degree of the splines.
@@ -132,6 +131,6 @@ def similarity_patch(
     region = np.pad(valid_region, padding, mode="reflect") if np.any(padding) else valid_region
     values = np.empty(side * side)
     row, column = position - start
-    if not quintic.sample(spline_coefficients(region), side, row, column, linear, values):
+    if not kernels.sample(spline_coefficients(region), side, row, column, linear, values):
         raise ValueError(f"the centre of a patch, {centre}, is outside the image of {image.shape[::-1]} pixels")
     return values.reshape(side, side)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
-from marsyard.algorithms.localisation.features import MapFeatures, solve_pose
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
+from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
+from marsyard.algorithms.localisation.sift_pose import MapFeatures, solve_pose
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
 
@@ -20,7 +20,7 @@ class InertialEstimator:
     def start(self, initial: InitialState, map_product: MapProduct) -> None:
         """Reset the state for a new descent."""
         self._map = map_product
-        self._filter = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._filter = LocalisationFilter.from_initial(initial, self.options.imu)
 
     def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments."""

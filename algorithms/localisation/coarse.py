@@ -17,13 +17,18 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2
-from marsyard.algorithms.localisation.coarse_candidates import OffsetCandidate, find_candidate_offsets, verify_candidate
-from marsyard.algorithms.localisation.coarse_patches import ImagePatch, correlate_patch, select_patches
+from marsyard.algorithms.arrays import Vector2
+from marsyard.algorithms.localisation.coarse_matching import (
+    ImagePatch,
+    OffsetCandidate,
+    correlate_patch,
+    find_candidate_offsets,
+    select_patches,
+    verify_candidate,
+)
 from marsyard.algorithms.localisation.consistency import (
-    Consistency,
     OffsetErrors,
     OffsetTest,
     PatchGeometry,
@@ -50,42 +55,15 @@ class CoarseRefusal(Enum):
 
 
 @dataclass(frozen=True)
-class CoarseMatches:
-    """Matches of the patches at the accepted offset, for figures. Positions are horizontal, in the world frame.
-
-    - images: index of each patch's image
-    - predicted_m: centres of the patches for the estimated position
-    - map_m: positions where they were found on the map
-    - scores: normalised correlations
-    - consistent: patches that agree with the accepted offset
-    - side_m: side of a patch
-    """
-
-    images: Int[np.ndarray, "n"]
-    predicted_m: Points2
-    map_m: Points2
-    scores: Vector
-    consistent: Flags
-    side_m: Float[np.ndarray, "n"]
-
-
-@dataclass(frozen=True)
 class CoarseFix:
     """Horizontal offset of the true position from the estimated one, the same for all images.
 
     - offset_m: true minus estimated position (east, north)
     - covariance: of the offset, m^2, by the stated errors of state, altitudes, map and matching
-    - matches: the patches' matches
-    - support, second_support: sums of the scores of the consistent patches of the best and of the second candidate
-    - consistency: test of the consistent patches' offsets
     """
 
     offset_m: Vector2
     covariance: Float[np.ndarray, "2 2"]
-    matches: CoarseMatches
-    support: float
-    second_support: float
-    consistency: Consistency | None = None
 
 
 def find_coarse_position(
@@ -161,15 +139,7 @@ def _accept_best_candidate(
     offset, offset_errors = estimate_position_error(
         best.offsets_m[rows[members]], geometry.select(members), covariance, errors
     )
-    best = replace(best, offset_m=offset, consistent=np.isin(np.arange(len(patches)), rows[members]))
-    return CoarseFix(
-        offset_m=offset,
-        covariance=offset_errors,
-        matches=_collect_matches(best, patches, grid),
-        support=best.support,
-        second_support=second,
-        consistency=consistency,
-    )
+    return CoarseFix(offset, offset_errors)
 
 
 def _describe_patches(
@@ -183,13 +153,17 @@ def _describe_patches(
     rows = np.flatnonzero(best.consistent)
     members = [patches[k] for k in rows.tolist()]
     images = np.array([patch.image for patch in members])
-    matches = _collect_matches(best, patches, grid)
+    corners = np.array([patch.corner for patch in members], dtype=np.float64)
+    sides = np.array([patch.side for patch in members], dtype=np.float64)
+    # centres of the patches for the estimated position, and where they were found on the map
+    predicted_m = grid.origin_m + grid.pixel_m * (corners + 0.5 * (sides[:, np.newaxis] - 1.0))
+    found_m = predicted_m + best.offsets_m[rows]
     below = np.array([elevation_at(grid, view.image.position_m[:2] + best.offset_m) for view in views])
-    heights = np.array([elevation_at(grid, found_m) for found_m in matches.map_m[rows]]) - below[images]
+    heights = np.array([elevation_at(grid, point_m) for point_m in found_m]) - below[images]
     cameras = np.stack([view.camera.c for view in views])[images]
-    lines = np.column_stack([matches.predicted_m[rows], heights]) - cameras
+    lines = np.column_stack([predicted_m, heights]) - cameras
     times = np.array([view.image.time_s for view in views])
-    geometry = PatchGeometry(images, matches.map_m[rows], matches.side_m[rows], lines, times[-1] - times[images])
+    geometry = PatchGeometry(images, found_m, sides * grid.pixel_m, lines, times[-1] - times[images])
     errors = OffsetErrors(
         height_m=np.hypot(options.altitude_sd * cameras[:, 2], grid.elevation_sd_m),
         distortion_m=grid.distortion_sd_m,
@@ -198,17 +172,3 @@ def _describe_patches(
         matching_m=grid.pixel_m / float(np.sqrt(12.0)),
     )
     return geometry, errors
-
-
-def _collect_matches(best: OffsetCandidate, patches: Sequence[ImagePatch], grid: MapProduct) -> CoarseMatches:
-    corners = np.array([patch.corner for patch in patches], dtype=np.float64)
-    sides = np.array([patch.side for patch in patches], dtype=np.float64)
-    predicted = grid.origin_m + grid.pixel_m * (corners + 0.5 * (sides[:, np.newaxis] - 1.0))
-    return CoarseMatches(
-        images=np.array([patch.image for patch in patches]),
-        predicted_m=predicted,
-        map_m=predicted + best.offsets_m,
-        scores=best.scores,
-        consistent=best.consistent,
-        side_m=sides * grid.pixel_m,
-    )

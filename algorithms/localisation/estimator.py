@@ -20,10 +20,10 @@ from marsyard.algorithms.localisation.fine import match_landmarks
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.landmarks import Landmarks, select_landmarks
 from marsyard.algorithms.localisation.map_sampling import elevation_at
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
+from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.algorithms.localisation.state_updates import GroundHeight, UpdateOutcome
+from marsyard.algorithms.localisation.state_updates import GroundHeight, LandmarkMeasurement, UpdateOutcome
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
 #: Distance over which the slope of the map's elevation is measured, map pixels.
@@ -41,7 +41,7 @@ class MapRelativeEstimator:
         self._map = map_product
         self._landmarks: Landmarks = select_landmarks(map_product, self.options)
         # pure inertial navigation: the filter returns to it when a coarse fix is discarded
-        self._inertial = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._inertial = LocalisationFilter.from_initial(initial, self.options.imu)
         self._filter = self._inertial
         self._has_fix = False
         self._increments_since_fix: list[ImuIncrements] = []
@@ -105,8 +105,7 @@ class MapRelativeEstimator:
             return None
         position_m = state.position_m[:2] + fix.offset_m
         updated = copy.deepcopy(self._inertial)
-        result = updated.update_position(image.time_s, position_m, fix.covariance)
-        if result.outcome is not UpdateOutcome.APPLIED:
+        if updated.update_position(image.time_s, position_m, fix.covariance) is not UpdateOutcome.APPLIED:
             return None
         self._filter = updated
         self._has_fix, self._failures, self._is_contradicted, self._last_update_s = True, 0, False, None
@@ -134,8 +133,7 @@ class MapRelativeEstimator:
         common_sd_m = np.hypot(
             options.common_fraction * point_sd_m, height_m * options.calibration_sd_rad * np.array([1.0, 1.0, 0.0])
         )
-        result = self._filter.update_landmarks(
-            image.time_s,
+        measurement = LandmarkMeasurement(
             image.camera,
             matches.points_m,
             matches.measured_px,
@@ -145,6 +143,7 @@ class MapRelativeEstimator:
             is_rigid=True,
             alignment_sd_rad=options.calibration_sd_rad,
         )
+        result = self._filter.update_landmarks(image.time_s, measurement)
         details = LocalisationDetails(
             "fine",
             coarse_position,

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -23,53 +23,34 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation import state_updates as updates
-from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
 from marsyard.algorithms.localisation.inertial_state import (
     ERRORS,
     GYRO_BIAS,
+    ImuErrorModel,
     IncrementHistory,
     NavigationState,
     propagate_states,
 )
 from marsyard.algorithms.localisation.interface import InitialState
 from marsyard.algorithms.localisation.state_updates import (
-    GateOptions,
     GroundModel,
     LandmarkMeasurement,
     LandmarkResult,
-    StateUpdate,
     UpdateOutcome,
 )
-from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import ImuIncrements
 
-Result = TypeVar("Result", StateUpdate, LandmarkResult)
+Result = TypeVar("Result", UpdateOutcome, LandmarkResult)
+#: Step of the time grid on which the covariance is propagated (assumed). At 0.5 rad/s a step of 0.1 s neglects
+#: rotations of 0.05 rad in the small terms that `compute_transition` names.
+_STEP_S = 0.1
+#: Time for which states and increments are stored for delayed updates (assumed).
+_MEMORY_S = 5.0
+#: Maximum time of a measurement after the last increment, or of an increment's tag from the end of the previous ones; a
+#: few sample intervals (assumed).
+MAX_EXTRAPOLATION_S = 0.02
 #: Minimum time between two tags: equal tags are separated by it, far below the tags' jitter.
 _MIN_INTERVAL_S = 1e-9
-
-
-@dataclass(frozen=True)
-class FilterOptions:
-    """Options of the navigation filter; the values are assumed except for those of the inertial unit.
-
-    - imu: errors of the inertial unit
-    - gates: limits of the updates
-    - altitude_sd_m: standard deviation of an altitude including the map's elevation, if the call gives none
-    - pixel_sd: standard deviation of a landmark's pixel per axis, if the call gives none
-    - step_s: step of the time grid on which the covariance is propagated. At 0.5 rad/s a step of 0.1 s neglects
-      rotations of 0.05 rad in the small terms that `compute_transition` names.
-    - memory_s: time for which states and increments are stored for delayed updates
-    - max_extrapolation_s: maximum time of a measurement after the last increment, or of an increment's tag from the end
-      of the previous ones; a few sample intervals
-    """
-
-    imu: ImuErrorModel = field(default_factory=ImuErrorModel)
-    gates: GateOptions = field(default_factory=GateOptions)
-    altitude_sd_m: float = 10.0
-    pixel_sd: float = 0.5
-    step_s: float = 0.1
-    memory_s: float = 5.0
-    max_extrapolation_s: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -87,8 +68,8 @@ class LocalisationFilter:
     does not change the state. A rejected update is stored: if an earlier measurement arrives later, it is tested again.
     """
 
-    def __init__(self, state: NavigationState, gravity_m_s2: float, options: FilterOptions) -> None:
-        self._gravity_m_s2, self._options = gravity_m_s2, options
+    def __init__(self, state: NavigationState, gravity_m_s2: float, imu: ImuErrorModel) -> None:
+        self._gravity_m_s2, self._imu = gravity_m_s2, imu
         self._start_s = state.time_s
         self._checkpoints = [_Checkpoint(state, 0)]
         self._history: IncrementHistory | None = None
@@ -96,16 +77,16 @@ class LocalisationFilter:
         self._updates: list[Callable[[NavigationState], NavigationState]] = []
 
     @classmethod
-    def from_initial(cls, initial: InitialState, options: FilterOptions | None = None) -> LocalisationFilter:
-        """Create the filter from a state of inertial navigation, with biases of zero."""
-        options = FilterOptions() if options is None else options
+    def from_initial(cls, initial: InitialState, imu: ImuErrorModel | None = None) -> LocalisationFilter:
+        """Create the filter from a state of inertial navigation, with biases of zero; `imu`: errors of the unit."""
+        imu = ImuErrorModel() if imu is None else imu
         covariance = np.zeros((ERRORS, ERRORS))
         covariance[: GYRO_BIAS.start, : GYRO_BIAS.start] = initial.covariance
-        covariance[GYRO_BIAS.start :, GYRO_BIAS.start :] = np.diag(options.imu.initial_bias_variances)
+        covariance[GYRO_BIAS.start :, GYRO_BIAS.start :] = np.diag(imu.initial_bias_variances)
         position, velocity = initial.position_m, initial.velocity_m_s
         zero, attitude = np.zeros(3), initial.world_from_body
         state = NavigationState(initial.time_s, position, velocity, attitude, zero, zero, covariance)
-        return cls(state, initial.gravity_m_s2, options)
+        return cls(state, initial.gravity_m_s2, imu)
 
     @property
     def time_s(self) -> float:
@@ -120,12 +101,12 @@ class LocalisationFilter:
     def propagate(self, increments: ImuIncrements) -> None:
         """Propagate by increments; their first boundary is the last one of the previous call.
 
-        Raises ValueError if it is not, apart from jitter of the tags up to `max_extrapolation_s`.
+        Raises ValueError if it is not, apart from jitter of the tags up to `MAX_EXTRAPOLATION_S`.
         """
         if len(increments.delta_angles_rad) == 0:
             return
         gap = float(increments.times_s[0]) - self.time_s
-        if abs(gap) > self._options.max_extrapolation_s:
+        if abs(gap) > MAX_EXTRAPOLATION_S:
             raise ValueError(f"increments begin {gap:+.6f} s from the end of the previous ones; allowed: consecutive")
         previous = self._history
         if previous is None:
@@ -144,7 +125,7 @@ class LocalisationFilter:
 
     def is_stored(self, time_s: float) -> bool:
         """Whether a time is in the stored history, so that a state exists and a measurement can be processed."""
-        extrapolation = 0.0 if self._history is None else self._options.max_extrapolation_s
+        extrapolation = 0.0 if self._history is None else MAX_EXTRAPOLATION_S
         return self.memory_start_s <= time_s <= self.time_s + extrapolation
 
     def state_at(self, time_s: float) -> NavigationState:
@@ -167,19 +148,14 @@ class LocalisationFilter:
 
     def update_position(
         self, time_s: float, horizontal_position_m: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]
-    ) -> StateUpdate:
+    ) -> UpdateOutcome:
         """Update by a horizontal position on the map (east, north), for example a coarse fix."""
-        update = partial(
-            updates.update_position,
-            horizontal_position_m=horizontal_position_m,
-            covariance=covariance,
-            options=self._options.gates,
-        )
-        return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
+        update = partial(updates.update_position, horizontal_position_m=horizontal_position_m, covariance=covariance)
+        return self._update(time_s, update, UpdateOutcome.OUTSIDE_HISTORY)
 
     def update_altitude(
-        self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float | None = None
-    ) -> StateUpdate:
+        self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float
+    ) -> UpdateOutcome:
         """Update by an altitude above the ground below the body frame's origin.
 
         `ground_height` is the map's height at the estimated position with its slope (east, north), or a function that
@@ -187,54 +163,14 @@ class LocalisationFilter:
         is extrapolated linearly to the true position: while the horizontal position is uncertain by more than the
         slope's extent, use a slope of zero and the relief's standard deviation.
         """
-        update = partial(
-            updates.update_altitude,
-            altitude_m=altitude_m,
-            ground=ground_height,
-            sd_m=self._options.altitude_sd_m if sd_m is None else sd_m,
-            options=self._options.gates,
-        )
-        return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
+        update = partial(updates.update_altitude, altitude_m=altitude_m, ground=ground_height, sd_m=sd_m)
+        return self._update(time_s, update, UpdateOutcome.OUTSIDE_HISTORY)
 
-    def update_landmarks(
-        self,
-        time_s: float,
-        camera: CameraModel,
-        points_world: Float[np.ndarray, "n 3"],
-        pixels: Float[np.ndarray, "n 2"],
-        pixel_sd: float | Float[np.ndarray, "n"] | None = None,
-        point_sd_m: float | Float[np.ndarray, "3"] = 0.0,
-        common_sd_m: float | Float[np.ndarray, "3"] = 0.0,
-        *,
-        is_rigid: bool = False,
-        alignment_sd_rad: float = 0.0,
-    ) -> LandmarkResult:
-        """Update by landmarks in an image, with rejection of outliers (`state_updates.update_landmarks`).
-
-        - camera: camera model in the body frame
-        - points_world, pixels: positions from the map, metres, and measured pixels
-        - pixel_sd: of the measured pixels per axis; one value or one per landmark
-        - point_sd_m: of the points' independent errors; one value or (east, north, up)
-        - common_sd_m: of the error that all points of the image have in common; one value or (east, north, up). It is
-          considered as independent between images.
-        - is_rigid: whether the matching has found that one correction of the pose explains all pixels. The motion of
-          all landmarks is then tested against the covariance, before outliers are rejected.
-        - alignment_sd_rad: error of the camera's alignment and calibration per axis, for this test
-        """
-        count = len(pixels)
-        measurement = LandmarkMeasurement(
-            camera=camera,
-            points_world=points_world,
-            pixels=pixels,
-            pixel_sd=np.full(count, self._options.pixel_sd if pixel_sd is None else pixel_sd, dtype=np.float64),
-            point_sd_m=np.full(3, point_sd_m, dtype=np.float64),
-            common_sd_m=np.full(3, common_sd_m, dtype=np.float64),
-            is_rigid=is_rigid,
-            alignment_sd_rad=alignment_sd_rad,
-        )
-        update = partial(updates.update_landmarks, measurement=measurement, options=self._options.gates)
+    def update_landmarks(self, time_s: float, measurement: LandmarkMeasurement) -> LandmarkResult:
+        """Update by landmarks in an image, with rejection of outliers (`state_updates.update_landmarks`)."""
+        count = len(measurement.pixels)
         outside = LandmarkResult(UpdateOutcome.OUTSIDE_HISTORY, np.zeros(count, bool), np.full((count, 2), np.nan))
-        return self._update(time_s, update, outside)
+        return self._update(time_s, partial(updates.update_landmarks, measurement=measurement), outside)
 
     def _update(
         self, time_s: float, update: Callable[[NavigationState], tuple[NavigationState, Result]], outside: Result
@@ -243,7 +179,7 @@ class LocalisationFilter:
         if not self.is_stored(time_s):
             return outside
         state, result = update(self.state_at(time_s))
-        if result.outcome is UpdateOutcome.INVALID:
+        if result is UpdateOutcome.INVALID:
             return result
         index = bisect_right(self._update_times_s, time_s)
         self._update_times_s.insert(index, time_s)
@@ -260,9 +196,9 @@ class LocalisationFilter:
 
     def _store_checkpoints(self) -> None:
         """Store checkpoints up to the last time of the grid and the last update within the increments."""
-        options, last = self._options, self._checkpoints[-1]
+        last = self._checkpoints[-1]
         pending = self._update_times_s[last.updates : bisect_right(self._update_times_s, self.time_s)]
-        grid_time_s = self._start_s + options.step_s * np.floor((self.time_s - self._start_s) / options.step_s)
+        grid_time_s = self._start_s + _STEP_S * np.floor((self.time_s - self._start_s) / _STEP_S)
         end_s = max([float(grid_time_s), *pending])
         if end_s > last.state.time_s:
             self._checkpoints += self._propagate_and_update(last, end_s)
@@ -287,15 +223,15 @@ class LocalisationFilter:
         """Propagate a state to the times of the grid before a time, and to that time."""
         if self._history is None or end_s <= state.time_s:
             return []
-        first, last = ((time_s - self._start_s) / self._options.step_s for time_s in (state.time_s, end_s))
-        grid = self._start_s + self._options.step_s * np.arange(np.floor(first), np.ceil(last) + 1.0)
+        first, last = ((time_s - self._start_s) / _STEP_S for time_s in (state.time_s, end_s))
+        grid = self._start_s + _STEP_S * np.arange(np.floor(first), np.ceil(last) + 1.0)
         times = np.append(grid[(grid > state.time_s) & (grid < end_s)], end_s)
-        return propagate_states(state, self._history, times, self._gravity_m_s2, self._options.imu)
+        return propagate_states(state, self._history, times, self._gravity_m_s2, self._imu)
 
     def _discard_old_states(self) -> None:
         """Remove states and increments that are older than the memory."""
         history = self._history
-        first_s = max(self.time_s - self._options.memory_s, self.memory_start_s)
+        first_s = max(self.time_s - _MEMORY_S, self.memory_start_s)
         self._checkpoints = self._checkpoints[self._last_checkpoint_before(first_s) :]
         if history is not None:
             interval = int(np.searchsorted(history.times_s, self.memory_start_s, side="right")) - 1

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
+from marsyard.algorithms.localisation.inertial_state import ImuErrorModel
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class LvsOptions:
       sum of the scores of the consistent patches (assumed)
 
     - patch_outlier_probability: Probability to remove a correct patch from the consistent ones, by its residual from
-      the prediction of the others (assumed; the value for a landmark in `GateOptions`)
+      the prediction of the others (assumed; the value for a landmark in `state_updates`)
     - false_refusal: Probability to refuse a correct coarse fix because its patches do not fit the stated errors of
-      state, altitudes and map (assumed; the value for a position in `GateOptions`)
+      state, altitudes and map (assumed; the value for a position in `state_updates`)
 
     Fine stage:
 

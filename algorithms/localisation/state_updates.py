@@ -33,6 +33,14 @@ GroundModel = Callable[[Float[np.ndarray, "2"]], GroundHeight] | GroundHeight
 _POSITION, _ATTITUDE, _COMMON = slice(0, 3), slice(3, 6), slice(6, 9)
 #: Independent components of the state that one image measures: position and attitude.
 _OBSERVED = 6
+#: Limits of the updates, all assumed. Probabilities to reject a correct position, altitude or landmark by its
+#: innovation before the update; a correct landmark by its residual; a correct image by its correction of the state.
+FALSE_REJECTION, OUTLIER_PROBABILITY, FALSE_INCONSISTENCY = 1e-4, 1e-3, 1e-5
+#: Minimum number of landmarks that agree (six coordinates determine position and attitude), and minimum fraction of
+#: visible landmarks that agree: chance agreement of outliers stays below it.
+MIN_LANDMARKS, MIN_FRACTION = 8, 0.4
+#: Maximum number of passes of the robust estimation, and of the outlier rejection.
+MAX_PASSES = 50
 #: Variances of position (100 km) and attitude (10 rad) that remove the prior knowledge of both if they are added.
 _FREE_VARIANCES = np.zeros(ERRORS)
 _FREE_VARIANCES[POSITION], _FREE_VARIANCES[ATTITUDE] = 1e5**2, 10.0**2
@@ -50,47 +58,16 @@ class UpdateOutcome(Enum):
 
 
 @dataclass(frozen=True)
-class StateUpdate:
-    """Result of an update of position or altitude; `normalised_square`: innovation' S^-1 innovation."""
-
-    outcome: UpdateOutcome
-    normalised_square: float = np.nan
-
-
-@dataclass(frozen=True)
 class LandmarkResult:
     """Result of an update by landmarks.
 
     - inliers: landmarks that agree with each other and with the state; all False if the points are invalid
     - residuals_px: measured minus expected pixels with the estimated state and common error; NaN if not visible
-    - shift_square: squared length of the whitened correction, about chi-square with 6 degrees of freedom if
-      consistent; after the outcome INCONSISTENT of the test of the rigid motion, the statistic of this test
     """
 
     outcome: UpdateOutcome
     inliers: Bool[np.ndarray, "n"]
     residuals_px: Float[np.ndarray, "n 2"]
-    shift_square: float = np.nan
-
-
-@dataclass(frozen=True)
-class GateOptions:
-    """Limits of the updates; all are assumed.
-
-    - false_rejection: probability to reject a correct position, altitude or landmark by its innovation before update
-    - outlier_probability: probability to reject a correct landmark by its residual
-    - false_inconsistency: probability to reject a correct image because of its correction of the state
-    - min_landmarks: minimum number of landmarks that agree; six coordinates determine position and attitude
-    - min_fraction: minimum fraction of visible landmarks that agree; chance agreement of outliers stays below it
-    - max_passes: maximum number of passes of the robust estimation, and of the outlier rejection
-    """
-
-    false_rejection: float = 1e-4
-    outlier_probability: float = 1e-3
-    false_inconsistency: float = 1e-5
-    min_landmarks: int = 8
-    min_fraction: float = 0.4
-    max_passes: int = 50
 
 
 @dataclass(frozen=True)
@@ -99,9 +76,10 @@ class LandmarkMeasurement:
 
     - camera: camera model in the body frame
     - points_world, pixels: positions from the map, metres, and measured pixels
-    - pixel_sd: standard deviation per axis and landmark, pixels
+    - pixel_sd: standard deviation of the measured pixels per axis
     - point_sd_m: independent error of the points (east, north, up)
-    - common_sd_m: error of the points that is equal for all landmarks of the image (east, north, up)
+    - common_sd_m: error of the points that is equal for all landmarks of the image (east, north, up). It is considered
+      as independent between images.
     - is_rigid: whether the matching has found that one correction of position and attitude explains all pixels; then
       this correction is tested before landmarks are rejected one by one
     - alignment_sd_rad: error of the camera's alignment and calibration per axis, for the test of the rigid motion
@@ -110,7 +88,7 @@ class LandmarkMeasurement:
     camera: CameraModel
     points_world: Float[np.ndarray, "n 3"]
     pixels: Float[np.ndarray, "n 2"]
-    pixel_sd: Float[np.ndarray, "n"]
+    pixel_sd: float
     point_sd_m: Float[np.ndarray, "3"]
     common_sd_m: Float[np.ndarray, "3"]
     is_rigid: bool = False
@@ -134,19 +112,16 @@ class Linearisation:
 
 
 def update_position(
-    state: NavigationState,
-    horizontal_position_m: Float[np.ndarray, "2"],
-    covariance: Float[np.ndarray, "2 2"],
-    options: GateOptions,
-) -> tuple[NavigationState, StateUpdate]:
+    state: NavigationState, horizontal_position_m: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]
+) -> tuple[NavigationState, UpdateOutcome]:
     """Update by a horizontal position (east, north) on the map."""
     residual = horizontal_position_m - state.position_m[:2]
-    return _update_gated(state, np.eye(2, ERRORS), residual, covariance, options)
+    return _update_gated(state, np.eye(2, ERRORS), residual, covariance)
 
 
 def update_altitude(
-    state: NavigationState, altitude_m: float, ground: GroundModel, sd_m: float, options: GateOptions
-) -> tuple[NavigationState, StateUpdate]:
+    state: NavigationState, altitude_m: float, ground: GroundModel, sd_m: float
+) -> tuple[NavigationState, UpdateOutcome]:
     """Update by the altitude above the map's ground below the body frame's origin.
 
     `sd_m` contains the error of the map's elevation and of the slope's linear extrapolation to the true position.
@@ -154,7 +129,7 @@ def update_altitude(
     height, slope = ground(state.position_m[:2]) if callable(ground) else ground
     jacobian = altitude_jacobian(slope)
     residual = np.array([altitude_m - (state.position_m[2] - height)])
-    return _update_gated(state, jacobian, residual, np.array([[sd_m**2]]), options)
+    return _update_gated(state, jacobian, residual, np.array([[sd_m**2]]))
 
 
 def altitude_jacobian(slope: Float[np.ndarray, "2"]) -> Float[np.ndarray, "1 15"]:
@@ -180,14 +155,14 @@ def linearise_landmarks(
     by_point = measurement.camera.projection_jacobian(points_body) @ rotation.T
     jacobian = np.concatenate([-by_point, by_point @ cross_matrix(lines), by_point], axis=-1)
     scaled = by_point * measurement.point_sd_m
-    noise = scaled @ scaled.transpose(0, 2, 1) + measurement.pixel_sd[:, None, None] ** 2 * np.eye(2)
+    noise = scaled @ scaled.transpose(0, 2, 1) + measurement.pixel_sd * measurement.pixel_sd * np.eye(2)
     visible = visible & np.isfinite(residuals).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     residuals[~visible], jacobian[~visible], noise[~visible] = 0.0, 0.0, np.eye(2)
     return Linearisation(visible, residuals, jacobian, noise)
 
 
 def update_landmarks(
-    state: NavigationState, measurement: LandmarkMeasurement, options: GateOptions
+    state: NavigationState, measurement: LandmarkMeasurement
 ) -> tuple[NavigationState, LandmarkResult]:
     """Update by the landmarks of an image, with rejection of outliers.
 
@@ -206,35 +181,36 @@ def update_landmarks(
     """
     problem = _LandmarkProblem(state, measurement)
     start = linearise_landmarks(measurement, state.position_m, state.world_from_body)
-    max_shift = float(chdtri(_OBSERVED, options.false_inconsistency))
+    max_shift = float(chdtri(_OBSERVED, FALSE_INCONSISTENCY))
     if measurement.is_rigid:
         motion, residuals = _test_rigid_motion(state, measurement, start.visible)
         if not motion < max_shift:
-            return state, LandmarkResult(UpdateOutcome.INCONSISTENT, np.zeros_like(start.visible), residuals, motion)
+            return state, LandmarkResult(UpdateOutcome.INCONSISTENT, np.zeros_like(start.visible), residuals)
     factors = start.jacobian @ problem.factor
     innovation_squares = _normalise(start.residuals, start.noise + factors @ factors.transpose(0, 2, 1))
-    candidates = start.visible & (innovation_squares < chdtri(2, options.false_rejection))
-    limit = float(chdtri(2, options.outlier_probability))
+    candidates = start.visible & (innovation_squares < chdtri(2, FALSE_REJECTION))
+    limit = float(chdtri(2, OUTLIER_PROBABILITY))
     whitened = np.zeros(ERRORS + 3)
     if candidates.any():
-        inliers, whitened = _estimate_robustly(problem, candidates, limit, options)
+        inliers, whitened = _estimate_robustly(problem, candidates, limit)
     else:
         inliers = candidates
-    for _ in range(options.max_passes):
+    for _ in range(MAX_PASSES):
         solution = problem.solve(inliers.astype(np.float64), whitened)
         whitened, previous = solution.whitened, inliers
         inliers = solution.linearisation.visible & (solution.squares < limit)
         if np.array_equal(inliers, previous):
             break
     residuals = np.where(solution.linearisation.visible[:, None], solution.residuals, np.nan)
+    # squared length of the whitened correction: about chi-square with 6 degrees of freedom if consistent
     shift = float(whitened @ whitened)
-    min_count = max(options.min_landmarks, options.min_fraction * int(start.visible.sum()))
+    min_count = max(MIN_LANDMARKS, MIN_FRACTION * int(start.visible.sum()))
     if int(inliers.sum()) < min_count:
-        return state, LandmarkResult(UpdateOutcome.TOO_FEW, inliers, residuals, shift)
+        return state, LandmarkResult(UpdateOutcome.TOO_FEW, inliers, residuals)
     if not shift < max_shift:
-        return state, LandmarkResult(UpdateOutcome.INCONSISTENT, inliers, residuals, shift)
+        return state, LandmarkResult(UpdateOutcome.INCONSISTENT, inliers, residuals)
     updated = state.correct(problem.errors(whitened), problem.covariance(solution.information))
-    return updated, LandmarkResult(UpdateOutcome.APPLIED, inliers, residuals, shift)
+    return updated, LandmarkResult(UpdateOutcome.APPLIED, inliers, residuals)
 
 
 def _test_rigid_motion(
@@ -322,7 +298,7 @@ class _LandmarkProblem:
 
 
 def _estimate_robustly(
-    problem: _LandmarkProblem, candidates: Bool[np.ndarray, "n"], limit: float, options: GateOptions
+    problem: _LandmarkProblem, candidates: Bool[np.ndarray, "n"], limit: float
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "18"]]:
     """Find the inliers among the candidates, and the whitened errors, by graduated non-convexity (Yang, Eq. 14)."""
     weights = candidates.astype(np.float64)
@@ -331,7 +307,7 @@ def _estimate_robustly(
     if largest < limit:
         return candidates, solution.whitened
     control = limit / (2.0 * largest - limit)
-    for _ in range(options.max_passes):
+    for _ in range(MAX_PASSES):
         squares = np.maximum(solution.squares, np.finfo(float).tiny)
         between = np.sqrt(limit * control * (control + 1.0) / squares) - control
         weights = np.where(candidates & solution.linearisation.visible, np.clip(between, 0.0, 1.0), 0.0)
@@ -347,21 +323,20 @@ def _update_gated(
     jacobian: Float[np.ndarray, "m 15"],
     residual: Float[np.ndarray, "m"],
     noise: Float[np.ndarray, "m m"],
-    options: GateOptions,
-) -> tuple[NavigationState, StateUpdate]:
+) -> tuple[NavigationState, UpdateOutcome]:
     """Update by a measurement with this Jacobian, unless its innovation is improbable."""
     if not (np.isfinite(residual).all() and np.isfinite(jacobian).all() and np.isfinite(noise).all()):
-        return state, StateUpdate(UpdateOutcome.INVALID)
+        return state, UpdateOutcome.INVALID
     root = square_root(state.covariance)
     factor = jacobian @ root
     square = float(residual @ np.linalg.solve(noise + factor @ factor.T, residual))
-    if not square < chdtri(len(residual), options.false_rejection):
-        return state, StateUpdate(UpdateOutcome.REJECTED, square)
+    if not square < chdtri(len(residual), FALSE_REJECTION):
+        return state, UpdateOutcome.REJECTED
     weighted = np.linalg.solve(noise, factor)
     lower = np.linalg.cholesky(symmetrise(np.eye(ERRORS) + factor.T @ weighted))
     half = linalg.solve_triangular(lower, root.T, lower=True)
     errors = half.T @ linalg.solve_triangular(lower, weighted.T @ residual, lower=True)
-    return state.correct(errors, half.T @ half), StateUpdate(UpdateOutcome.APPLIED, square)
+    return state.correct(errors, half.T @ half), UpdateOutcome.APPLIED
 
 
 def square_root(covariance: ErrorMatrix) -> ErrorMatrix:

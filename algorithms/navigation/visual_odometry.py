@@ -21,41 +21,23 @@ from marsyard.algorithms.navigation.stereo import RectifiedPair, track_features
 from marsyard.sim.frames import rigid_from_axes, rotation_matrix
 from marsyard.sim.measurements import StereoMeasurement
 
+#: Maximum number of features, their minimum distance in pixels, and the minimum corner strength of a feature divided by
+#: that of the strongest.
+_FEATURES, _SPACING_PX, _QUALITY = 300, 6.0, 0.003
+#: Minimum depth of matched points, metres; error of a matched coordinate (1 sigma), and maximum reprojection error of
+#: an inlier, pixels.
+_MIN_RANGE_M, _MATCH_ERROR_PX, _INLIER_PX = 1.0, 0.25, 1.5
+#: Minimum numbers of tracked features and of inliers.
+_MIN_FEATURES, _MIN_INLIERS = 20, 12
+#: Maximum standard deviation of the position along any axis, metres; maximum distance from the predicted position
+#: divided by the predicted path (wheels that slip completely differ by 1); maximum angle from the gyros' rotation.
+_MAX_SIGMA_M, _MAX_EXCESS, _MAX_TURN_ERROR_RAD = 0.03, 1.3, float(np.radians(2.0))
 #: Iterations and confidence of the robust pose estimate.
 _RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 300, 0.999
 #: Number of adjustments, each followed by a rejection of outliers, and largest normalised distance of an inlier.
 _ADJUSTMENTS, _MAX_NORMALISED_DISTANCE = 3, 3.5
 #: Additional distance from the predicted position that is accepted, metres.
 _MAX_EXCESS_M = 0.05
-
-
-@dataclass(frozen=True)
-class VisualOdometryOptions:
-    """Parameters of visual odometry.
-
-    - features, spacing_px: maximum number of features, and their minimum distance
-    - quality: minimum corner strength of a feature divided by that of the strongest
-    - min_range_m: minimum depth of matched points
-    - match_error_px: error of a matched coordinate, 1 sigma
-    - inlier_px: maximum reprojection error of an inlier
-    - min_features, min_inliers: minimum numbers of tracked features and of inliers
-    - max_sigma_m: maximum standard deviation of the position along any axis
-    - max_excess: maximum distance from the predicted position, divided by the predicted path; wheels that slip
-      completely differ by 1
-    - max_turn_error_rad: maximum angle from the rotation that the gyros measured
-    """
-
-    features: int = 300
-    spacing_px: float = 6.0
-    quality: float = 0.003
-    min_range_m: float = 1.0
-    match_error_px: float = 0.25
-    inlier_px: float = 1.5
-    min_features: int = 20
-    min_inliers: int = 12
-    max_sigma_m: float = 0.03
-    max_excess: float = 1.3
-    max_turn_error_rad: float = float(np.radians(2.0))
 
 
 class VisualOdometryOutcome(Enum):
@@ -83,20 +65,14 @@ class MotionEstimate:
     sigma_m: float
 
 
-def estimate_motion(
-    first: StereoMeasurement,
-    second: StereoMeasurement,
-    predicted: RigidTransform,
-    options: VisualOdometryOptions | None = None,
-) -> MotionEstimate:
+def estimate_motion(first: StereoMeasurement, second: StereoMeasurement, predicted: RigidTransform) -> MotionEstimate:
     """Estimate the rover's motion between two stereo pairs.
 
     `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
     """
-    options = VisualOdometryOptions() if options is None else options
     first_pair, second_pair = RectifiedPair.from_measurement(first), RectifiedPair.from_measurement(second)
-    pixels = _detect_features(first_pair, options)
-    disparities, valid = first_pair.feature_disparities(pixels, options.min_range_m)
+    pixels = _detect_features(first_pair)
+    disparities, valid = first_pair.feature_disparities(pixels, _MIN_RANGE_M)
     pixels, disparities = pixels[valid], disparities[valid]
     points = first_pair.triangulate(pixels, disparities)
     expected_pixels, visible = second_pair.camera.project(
@@ -105,22 +81,22 @@ def estimate_motion(
     inside = visible & second_pair.camera.in_frame(expected_pixels)
     pixels, disparities, points = (values[inside] for values in (pixels, disparities, points))
     second_pixels, valid = track_features(first_pair.left, second_pair.left, pixels, expected_pixels[inside])
-    second_disparities, is_matched = second_pair.feature_disparities(second_pixels, options.min_range_m)
+    second_disparities, is_matched = second_pair.feature_disparities(second_pixels, _MIN_RANGE_M)
     valid &= is_matched
     count = int(np.count_nonzero(valid))
-    if count < options.min_features:
+    if count < _MIN_FEATURES:
         return MotionEstimate(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
     pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
     second_pixels, second_disparities = second_pixels[valid], second_disparities[valid]
     second_points = second_pair.triangulate(second_pixels, second_disparities)
-    inliers = _find_inliers(second_pair, points, second_pixels, predicted, options)
+    inliers = _find_inliers(second_pair, points, second_pixels, predicted)
     covariances = (
-        first_pair.covariances(pixels, disparities, options.match_error_px),
-        second_pair.covariances(second_pixels, second_disparities, options.match_error_px),
+        first_pair.covariances(pixels, disparities, _MATCH_ERROR_PX),
+        second_pair.covariances(second_pixels, second_disparities, _MATCH_ERROR_PX),
     )
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
-        if np.count_nonzero(inliers) < options.min_inliers:
+        if np.count_nonzero(inliers) < _MIN_INLIERS:
             return MotionEstimate(
                 VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, int(np.count_nonzero(inliers)), float("nan")
             )
@@ -130,21 +106,19 @@ def estimate_motion(
         distances = np.linalg.norm(residuals, axis=1)
         inliers = distances <= _MAX_NORMALISED_DISTANCE
     inlier_count = int(np.count_nonzero(inliers))
-    outcome = _check_motion(motion, sigma_m, predicted, options)
+    outcome = _check_motion(motion, sigma_m, predicted)
     is_valid = outcome is VisualOdometryOutcome.CONVERGED
     return MotionEstimate(outcome, motion if is_valid else None, count, inlier_count, sigma_m)
 
 
-def _detect_features(pair: RectifiedPair, options: VisualOdometryOptions) -> Points2:
+def _detect_features(pair: RectifiedPair) -> Points2:
     """Detect corners (u, v) in the left image, at least four pixels from its border and from pixels without data."""
     mask = cv2.erode((pair.left > 0).astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
-    corners = cv2.goodFeaturesToTrack(pair.left, options.features, options.quality, options.spacing_px, mask=mask)
+    corners = cv2.goodFeaturesToTrack(pair.left, _FEATURES, _QUALITY, _SPACING_PX, mask=mask)
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
-def _find_inliers(
-    pair: RectifiedPair, points: Points3, pixels: Points2, predicted: RigidTransform, options: VisualOdometryOptions
-) -> Flags:
+def _find_inliers(pair: RectifiedPair, points: Points3, pixels: Points2, predicted: RigidTransform) -> Flags:
     """Find the points whose pixels in the second image agree with one motion (RANSAC over poses from three points)."""
     axes = np.stack([pair.camera.right, pair.camera.down, pair.camera.a])
     focal, (column, row) = pair.camera.focal_lengths[0], pair.camera.image_centre
@@ -154,7 +128,7 @@ def _find_inliers(
     translation = axes @ (predicted.inv().translation - pair.camera.c)
     is_solved, _, _, inliers = cv2.solvePnPRansac(
         points, pixels, matrix, None, rotation.as_rotvec().reshape(3, 1), translation.reshape(3, 1), True,
-        _RANSAC_ITERATIONS, options.inlier_px, _RANSAC_CONFIDENCE, flags=cv2.SOLVEPNP_ITERATIVE,
+        _RANSAC_ITERATIONS, _INLIER_PX, _RANSAC_CONFIDENCE, flags=cv2.SOLVEPNP_ITERATIVE,
     )  # fmt: skip
     flags = np.zeros(len(points), dtype=np.bool_)
     if is_solved and inliers is not None:
@@ -220,15 +194,13 @@ def _refine_motion(
     return rigid_from_axes(*correct_motion(solution.x)), float(sigma)
 
 
-def _check_motion(
-    motion: RigidTransform, sigma_m: float, predicted: RigidTransform, options: VisualOdometryOptions
-) -> VisualOdometryOutcome:
+def _check_motion(motion: RigidTransform, sigma_m: float, predicted: RigidTransform) -> VisualOdometryOutcome:
     """Return the outcome of an estimated motion: accuracy, and agreement with the prediction."""
-    if not sigma_m <= options.max_sigma_m:
+    if not sigma_m <= _MAX_SIGMA_M:
         return VisualOdometryOutcome.INACCURATE
     path_m = float(np.linalg.norm(predicted.translation))
     excess_m = float(np.linalg.norm(motion.translation - predicted.translation))
     turn_error_rad = (predicted.rotation.inv() * motion.rotation).magnitude()
-    if excess_m > options.max_excess * path_m + _MAX_EXCESS_M or turn_error_rad > options.max_turn_error_rad:
+    if excess_m > _MAX_EXCESS * path_m + _MAX_EXCESS_M or turn_error_rad > _MAX_TURN_ERROR_RAD:
         return VisualOdometryOutcome.INCONSISTENT
     return VisualOdometryOutcome.CONVERGED

@@ -146,6 +146,11 @@ class VisualTargetTracker:
         return TargetUpdate(self.track.state, result.losses, position, result.details)
 
 
+def lucas_kanade_tracker(options: VttOptions | None = None) -> VisualTargetTracker:
+    """Create the baseline that matches by optical flow (Lucas-Kanade); options of the correlation search are unused."""
+    return VisualTargetTracker(options, matching.match_by_lucas_kanade)
+
+
 @dataclass(frozen=True)
 class TrackResult:
     """Result of one update: the losses, or the target's position (rover frame, metres) and the new reference."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.chaos import FAULTS, ChaosParameters, draw_fault
+from benchmarks.validation.chaos import FAULTS, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.executors import ExecutorConfig
@@ -104,7 +104,7 @@ def check_survival(quick: bool) -> Iterator[Measure]:
             )
             elapsed_s[fraction] = time.monotonic() - start_s
         campaign = load_campaign(str(file), [f"faulty_fraction={faulty_fraction}"])
-        faults = [_draw_fault(campaign, case) for case in range(cases)]
+        faults = [draw_fault(campaign.parameters(case), campaign.streams(case)) for case in range(cases)]
         faulty_rows, reference_rows = rows[faulty_fraction], rows[0.0]
         wrong_count = sum(
             row["outcome"] != FAULTS.get(fault, "VALID") for row, fault in zip(faulty_rows, faults, strict=True)
@@ -125,13 +125,6 @@ def check_survival(quick: bool) -> Iterator[Measure]:
             1.5,
             f"{how}; limits: {limits_s:g} s",
         )
-
-
-def _draw_fault(campaign: Any, case: int) -> str:
-    """Draw the fault of a case as in the campaign; empty for a case without fault."""
-    parameters = campaign.parameters(case)
-    assert isinstance(parameters, ChaosParameters)
-    return draw_fault(parameters, campaign.streams(case))
 
 
 def _write_campaign(folder: Path) -> Path:

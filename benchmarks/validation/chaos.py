@@ -3,6 +3,7 @@
 import os
 import re
 import time
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -24,23 +25,27 @@ class ChaosParameters(BaseModel):
 FAULTS = {"raise": "CRASHED", "loop": "TIMED_OUT", "allocate": "OUT_OF_MEMORY", "abort": "CRASHED"}
 
 
-def draw_fault(parameters: ChaosParameters, streams: Streams) -> str:
+def draw_fault(parameters: Any, streams: Streams) -> str:
     """Draw the fault of a case; empty for a case without fault."""
     rng = streams.generator("chaos")
     return str(rng.choice(list(FAULTS))) if rng.random() < parameters.faulty_fraction else ""
 
 
-class ChaosScenario:
+class WithoutSharedInputs:
+    """Base class of scenarios whose cases share no inputs."""
+
+    def shared_inputs(self, parameters: Any) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: Any, shared_input: int) -> None:
+        """There are no shared inputs."""
+
+
+class ChaosScenario(WithoutSharedInputs):
     """Scenario that computes for `work_s`, then answers, raises, loops in C, allocates without end, or aborts."""
 
     name = "chaos"
     parameters_type = ChaosParameters
-
-    def shared_inputs(self, parameters: ChaosParameters) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: ChaosParameters, shared_input: int) -> None:
-        """There are no shared inputs."""
 
     def run(self, parameters: ChaosParameters, streams: Streams) -> CaseResult:
         end = time.process_time() + parameters.work_s

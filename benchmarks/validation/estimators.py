@@ -66,13 +66,9 @@ class SmoothImage:
 class Shifts:
     """Result of symmetric Gauss-Newton estimation.
 
-    Attributes
-    ----------
-    motion_px
-        Motion (u, v) of each patch from the first image to the second, shape (n, 2).
-    response
-        Derivative of the estimate (second axis) with respect to the motion of each pixel (last axis), shape
-        (n, 2, PATCH, PATCH, 2). The expected estimate is the sum of the pixel motions with these weights.
+    - motion_px: motion (u, v) of each patch from the first image to the second, shape (n, 2)
+    - response: derivative of the estimate (second axis) with respect to the motion of each pixel (last axis), shape
+      (n, 2, PATCH, PATCH, 2); the expected estimate is the sum of the pixel motions with these weights
     """
 
     motion_px: np.ndarray

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from benchmarks.validation.chaos import WithoutSharedInputs
 from marsyard.scenarios.input_copies import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
@@ -167,23 +168,17 @@ FAULTS: Mapping[str, tuple[Callable[[], object], str]] = {
 }
 
 
-def draw_fault(parameters: HostileParameters, streams: Streams) -> str:
+def draw_fault(parameters: Any, streams: Streams) -> str:
     """Draw the fault of a case; empty for a case without fault."""
     rng = streams.generator("deed")
     return str(rng.choice(list(FAULTS))) if rng.random() < parameters.misbehaving else ""
 
 
-class HostileScenario:
+class HostileScenario(WithoutSharedInputs):
     """Scenario that computes numbers from the process state, then executes the fault of the case."""
 
     name = "hostile"
     parameters_type = HostileParameters
-
-    def shared_inputs(self, parameters: HostileParameters) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: HostileParameters, shared_input: int) -> None:
-        """There are no shared inputs."""
 
     def run(self, parameters: HostileParameters, streams: Streams) -> CaseResult:
         if _CHANGED_STATE in _remaining_objects:

@@ -48,12 +48,8 @@ REQUIRED_M_S = 5.0
 class VelocityErrors:
     """Velocity errors of simulated descents, m/s, axes east and north; the true values cancel in a discrepancy.
 
-    Attributes
-    ----------
-    tracks_m_s
-        Errors of the velocities of correct tracks by descent, pair and template, shape (n, 2, 2, 2).
-    imu_m_s
-        Error of the change of velocity that the IMU measures, shape (n, 2).
+    - tracks_m_s: errors of the velocities of correct tracks by descent, pair and template, shape (n, 2, 2, 2)
+    - imu_m_s: error of the change of velocity that the IMU measures, shape (n, 2)
     """
 
     tracks_m_s: Float[np.ndarray, "n 2 2 2"]

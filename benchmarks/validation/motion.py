@@ -53,14 +53,10 @@ class View:
 class Motion:
     """Errors of one step, (u, v) of each patch, shape (patches, 2).
 
-    Attributes
-    ----------
-    step_px
-        Motion of the image centre.
-    error, parabola, biquadratic
-        Motion by symmetric Gauss-Newton estimation and by fits to the correlation peak, minus the true motion.
-    body
-        Body of each patch: number of the body, -1 for the ground, or `MIXED`.
+    - step_px: motion of the image centre
+    - error, parabola, biquadratic: motion by symmetric Gauss-Newton estimation and by fits to the correlation peak,
+      minus the true motion
+    - body: body of each patch: number of the body, -1 for the ground, or `MIXED`
     """
 
     step_px: float

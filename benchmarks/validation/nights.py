@@ -8,9 +8,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import FINISHED, History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import NightComparison, find_changes
-from marsyard.reports.statistics.changes import Metric, Sample
+from marsyard.reports.nightly import FINISHED, History, NightCampaign, NightComparison, find_changes, list_comparisons
+from marsyard.reports.statistics.difference_tests import Metric, Sample
 
 #: Assignments of cases to terrains.
 KINDS = ("a bank of 12 terrains", "20 new terrains every night", "a terrain for each case")

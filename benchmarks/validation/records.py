@@ -1,5 +1,6 @@
 """Records of validation checks: claim, limit and measured value."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -11,16 +12,10 @@ from marsyard.reports.validation_rows import Conditions
 class Measure:
     """One measurement: a row of the tables in docs/validation.md.
 
-    Attributes
-    ----------
-    claim
-        Validated property.
-    measured, unit
-        Measured value and its unit; "" for a fraction, "1" for another number without a unit.
-    limit, sense
-        Limit (None for values without a limit), and whether it is an upper or lower limit.
-    how
-        Short description of the method.
+    - claim: validated property
+    - measured, unit: measured value and its unit; "" for a fraction, "1" for another number without a unit
+    - limit, sense: limit (None for values without a limit), and whether it is an upper or lower limit
+    - how: short description of the method
     """
 
     claim: str
@@ -39,22 +34,22 @@ class Measure:
         return self.measured <= self.limit if self.sense == "at most" else self.measured >= self.limit
 
 
+def min_coverage(nominal: float, trials: int) -> float:
+    """Minimum of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
+    return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
+
+
 @dataclass(frozen=True)
 class Check:
     """A group of measurements that run together.
 
-    Attributes
-    ----------
-    name
-        Name on the command line.
-    section
-        Heading of its rows in the document.
-    run
-        Function that yields the measurements; its argument `quick` selects fewer samples (with the same limits).
-    method_columns
-        Headings of the last columns of its table; `Measure.how` contains a cell for each, separated by " | ".
-    conditions
-        Conditions in which its rows are checked; the first whose pattern matches the claim of a row applies to it.
+    - name: name on the command line
+    - section: heading of its rows in the document
+    - run: function that yields the measurements; its argument `quick` selects fewer samples (with the same limits)
+    - method_columns: headings of the last columns of its table; `Measure.how` contains a cell for each, separated by
+      " | "
+    - conditions: conditions in which its rows are checked; the first whose pattern matches the claim of a row applies
+      to it
     """
 
     name: str

@@ -13,13 +13,12 @@ from scipy import integrate, optimize
 from scipy.special import ndtr, ndtri
 from scipy.stats import norm, poisson, truncnorm
 
-from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.records import Check, Measure, min_coverage
 from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.dispersion_changes import Change, ChangeKind, list_changes
 from marsyard.reports.robustness import change_rates
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.crossing import Crossing, find_crossing
-from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import MIN_EFFECTIVE, Crossing, find_crossing, weighted_rates
 from marsyard.reports.verdicts import Verdict
 
 _CONFIDENCE = 0.9
@@ -127,7 +126,7 @@ def run_changes(quick: bool) -> Iterator[Measure]:
             shown = float(np.mean([not item.upper < state.exact for item in samples]))
             claim = f"90 % interval of the change to FAIL, {state.name}, {size} cases"
             how = f"{trials} campaigns; the worse of both ends"
-            yield Measure(claim, min(lost, shown), "", _min_coverage(trials), how, "at least")
+            yield Measure(claim, min(lost, shown), "", min_coverage(_CONFIDENCE, trials), how, "at least")
     fewest = min(item.effective_cases for item, _ in found if item.lower > 0.0 or not math.isnan(item.change))
     yield Measure(
         "fewest effective cases of a stated change",
@@ -160,7 +159,7 @@ def _run_terrains(rng: np.random.Generator, trials: int) -> Iterator[Measure]:
             f"90 % bound of the failure rate after a shift of {shift}, terrains with a correlation of {correlation:g}"
         )
         how = f"{trials} campaigns of {terrains} terrains with {cases} cases"
-        yield Measure(claim, float(np.mean(is_covered)), "", _min_coverage(trials), how, "at least")
+        yield Measure(claim, float(np.mean(is_covered)), "", min_coverage(_CONFIDENCE, trials), how, "at least")
 
 
 def _judge(success: np.ndarray, groups: np.ndarray, permitted: float) -> Verdict:
@@ -175,11 +174,6 @@ def _judge(success: np.ndarray, groups: np.ndarray, permitted: float) -> Verdict
 def _evidence(success: np.ndarray, groups: np.ndarray) -> CaseEvidence:
     everywhere = np.ones(success.size, dtype=np.bool_)
     return CaseEvidence(success, everywhere, groups, everywhere)
-
-
-def _min_coverage(trials: int) -> float:
-    """Minimum of a simulated coverage: the confidence minus three standard deviations of the simulation."""
-    return _CONFIDENCE - 3.0 * math.sqrt(_CONFIDENCE * (1.0 - _CONFIDENCE) / trials)
 
 
 CHECKS = (Check("robust", "Statistics", run_changes),)

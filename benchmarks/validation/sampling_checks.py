@@ -47,14 +47,8 @@ def seeds(words: np.ndarray) -> np.ndarray:
 
     The initial state of a generator is a bijection of the pool. Two streams are equal only if their pools are equal.
 
-    Parameters
-    ----------
-    words
-        Entropy, (sequences, words) of uint32: words of the root seed, padded to four, then of the spawn key.
-
-    Returns
-    -------
-    Pools, (sequences, 2) of uint64.
+    - words: entropy, (sequences, words) of uint32: words of the root seed, padded to four, then of the spawn key
+    - returns: pools, (sequences, 2) of uint64
     """
     hash_word = _Hash()
     pool = [hash_word(words[:, index]) for index in range(_POOL_WORDS)]

@@ -12,11 +12,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.hostile import FAULTS, HostileParameters, draw_fault
+from benchmarks.validation.hostile import FAULTS, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
@@ -56,20 +55,13 @@ _MAX_SHUTDOWN_S = 10.0
 class SoakResult:
     """Result of a soak test.
 
-    Attributes
-    ----------
-    kills
-        Number of runs that were killed before their end.
-    finished
-        Whether the last run finished the campaign.
-    seconds
-        Duration of all runs.
-    faults
-        Fault of each case; empty for cases without fault.
-    wrong_outcomes, changed_cases
-        Descriptions of cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
-    remaining_processes, remaining_files
-        Numbers of processes and temporary files after the last run.
+    - kills: number of runs that were killed before their end
+    - finished: whether the last run finished the campaign
+    - seconds: duration of all runs
+    - faults: fault of each case; empty for cases without fault
+    - wrong_outcomes: descriptions of cases with an unexpected outcome
+    - changed_cases: valid cases whose row differs from the undisturbed campaign
+    - remaining_processes, remaining_files: numbers of processes and temporary files after the last run
     """
 
     kills: int
@@ -85,16 +77,10 @@ class SoakResult:
 def run_soak_test(
     folder: Path, cases: int, kills: int, fault_fraction: float, kill_delay_s: tuple[float, float]
 ) -> SoakResult:
-    """Run the soak test in a folder, with and without faults.
+    """Run the soak test in an empty folder, with and without faults.
 
-    Parameters
-    ----------
-    folder
-        Empty folder.
-    cases, fault_fraction
-        Number of cases, and fraction of cases with a fault.
-    kills, kill_delay_s
-        Number of kills, and minimum and maximum of the uniform time before each kill.
+    - cases, fault_fraction: number of cases, and fraction of cases with a fault
+    - kills, kill_delay_s: number of kills, and minimum and maximum of the uniform time before each kill
     """
     temporary = folder / "tmp"
     temporary.mkdir()
@@ -112,7 +98,7 @@ def run_soak_test(
     assert undisturbed_status == 0, "the undisturbed campaign failed"
     rows = {name: read_rows(folder / name / "cases.parquet") for name in ("healthy", "soaked")}
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={fault_fraction}"])
-    faults = tuple(_draw_fault(campaign, case) for case in range(cases))
+    faults = tuple(draw_fault(campaign.parameters(case), campaign.streams(case)) for case in range(cases))
     pairs = list(zip(faults, rows["soaked"], rows["healthy"], strict=True))
     # `FAULTS` contains a function and the expected outcome of each fault
     return SoakResult(
@@ -180,13 +166,6 @@ def _find_processes(folder: Path) -> list[int]:
             if variable in (process / "environ").read_bytes():
                 ids.append(int(process.name))
     return ids
-
-
-def _draw_fault(campaign: Any, case: int) -> str:
-    """Draw the fault of a case; empty without a fault."""
-    parameters = campaign.parameters(case)
-    assert isinstance(parameters, HostileParameters)
-    return draw_fault(parameters, campaign.streams(case))
 
 
 def check_isolation(quick: bool) -> Iterator[Measure]:

@@ -17,26 +17,20 @@ from benchmarks.validation.nights import (
     count_detections,
     count_false_alarms,
 )
-from benchmarks.validation.records import Check, Measure
-from marsyard.reports.history import MAX_EARLIER_NIGHTS
+from benchmarks.validation.records import Check, Measure, min_coverage
+from marsyard.reports.nightly import MAX_EARLIER_NIGHTS
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import max_statistic
-from marsyard.reports.statistics.ellipse import error_ellipse
+from marsyard.reports.statistics.clusters import Sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.error_summary import error_ellipse
 from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, standard_deviation_interval
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
-from marsyard.reports.statistics.terrain_sizes import Sizes, event_scores, number_terrains
 from marsyard.reports.validation_rows import Conditions
 
 #: One-sided confidence of the checked bounds.
 CONFIDENCE = 0.9
 #: Cases per terrain.
 _CASES_PER_TERRAIN = 8
-
-
-def _min_coverage(nominal: float, trials: int) -> float:
-    """Minimum of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
-    return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
 def _fraction(successes: Iterator[bool], trials: int) -> float:
@@ -63,14 +57,14 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
             coverage = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
             how = f"{trials} samples of 30; BCa, widened; limit: nominal minus three deviations of the simulation"
             yield Measure(
-                f"95 % interval of the {statistic}, {name}", coverage, "", _min_coverage(0.95, trials), how, "at least"
+                f"95 % interval of the {statistic}, {name}", coverage, "", min_coverage(0.95, trials), how, "at least"
             )
     truth = float(stats.norm.ppf(0.95))
     bounds = [quantile_bounds(rng.normal(size=80), 0.95, CONFIDENCE) for _ in range(20 * trials)]
     bound_coverage = min(np.mean([low <= truth for low, _ in bounds]), np.mean([high >= truth for _, high in bounds]))
     how = f"{20 * trials} samples of 80; the worse of the lower and the upper bound"
     yield Measure(
-        "90 % bounds of a 95 % quantile", float(bound_coverage), "", _min_coverage(0.9, 20 * trials), how, "at least"
+        "90 % bounds of a 95 % quantile", float(bound_coverage), "", min_coverage(0.9, 20 * trials), how, "at least"
     )
     inside_count = 0
     for _ in range(4 * trials):
@@ -87,7 +81,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         "95 % ellipse contains the next error",
         inside_count / (4 * trials),
         "",
-        _min_coverage(0.95, 4 * trials),
+        min_coverage(0.95, 4 * trials),
         how,
         "at least",
     )
@@ -138,7 +132,7 @@ def run_correlated_rates(quick: bool) -> Iterator[Measure]:
                 too_high = float(np.mean(_statistics(cases - events, sizes) <= limits[1]))
                 claim = f"90 % bounds, failure rate {rate}, correlation {correlation:g}, {design}"
                 how = f"{trials} campaigns; the worse of both bounds"
-                limit = _min_coverage(CONFIDENCE, trials)
+                limit = min_coverage(CONFIDENCE, trials)
                 yield Measure(claim, 1.0 - max(too_low, too_high), "", limit, how, "at least")
 
 
@@ -172,7 +166,7 @@ def run_correlated_errors(quick: bool) -> Iterator[Measure]:
                 claim = f"{100 * nominal:.0f} % {interval} of the {statistic}, "
                 claim += f"correlation {correlation}, {terrains} terrains"
                 how = f"{trials} campaigns, 1 to 14 normal errors per terrain"
-                yield Measure(claim, coverage, "", _min_coverage(nominal, trials), how, "at least")
+                yield Measure(claim, coverage, "", min_coverage(nominal, trials), how, "at least")
 
 
 def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +203,7 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
             how = (
                 f"{trials} campaigns of up to {max_cases} cases at a true rate of {required}; Monte Carlo error allowed"
             )
-            limit = 1.0 - _min_coverage(CONFIDENCE, trials)
+            limit = 1.0 - min_coverage(CONFIDENCE, trials)
             for verdict, fraction in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
                 yield Measure(f"false {verdict} of {required} at 90 %, {kind}", fraction, "", limit, how)
 

@@ -20,9 +20,8 @@ from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.interface import HasAlgorithms
-from marsyard.scenarios.offline_algorithms import ANSWERS, CASES
+from marsyard.scenarios.offline_algorithms import ANSWERS, CASES, read_answers
 from marsyard.scenarios.tasks import Task
 
 #: Files that describe an exported folder, for programs and for the team under test.

@@ -30,9 +30,7 @@ from marsyard.cli.errors import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import MetricChange
-from marsyard.reports.night_page import format_night_page
+from marsyard.reports.nightly import History, MetricChange, NightCampaign, format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters
 
 #: The plan that is installed with Marsyard.

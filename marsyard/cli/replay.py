@@ -54,7 +54,7 @@ def replay(
         write_packed,
         write_stages,
     )
-    from marsyard.reports.case_views import write_case_figures
+    from marsyard.reports.presentation import write_case_figures
 
     exports = _check_exports({"--rerun": rerun, "--glb": glb, "--rosbag": rosbag})
     if trust:

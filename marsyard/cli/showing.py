@@ -18,8 +18,7 @@ from marsyard.campaigns.definition.parameter_paths import leaves, value_at
 from marsyard.campaigns.definition.toml_models import description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.requirement_wording import requirement_text
-from marsyard.reports.wording import count
+from marsyard.reports.wording import count, requirement_text
 from marsyard.scenarios.columns import split_unit
 
 if TYPE_CHECKING:

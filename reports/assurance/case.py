@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.claims import Confirmation
-from marsyard.reports.assurance.elements import Element, ElementKind, GoalState, defeater, goal, number_elements
+from marsyard.reports.assurance.argument import Element, ElementKind, GoalState, defeater, goal, number_elements
 from marsyard.reports.fits import Constant, read_constants
+from marsyard.reports.provenance import format_tested_algorithms
 from marsyard.reports.report_file import CampaignReport
 from marsyard.reports.stored import table
-from marsyard.reports.tested_algorithms import format_tested_algorithms
 from marsyard.reports.validation_rows import RowKind, ValidationRow, read_checks
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count, format_fraction, percent

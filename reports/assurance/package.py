@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -22,8 +21,8 @@ from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import ROBUST_FOLDER
+from marsyard.reports.assurance.argument import draw_case
 from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuranceCase, AssuredRun, build_case
-from marsyard.reports.assurance.drawing import draw_case
 from marsyard.reports.assurance.signature import signature_path
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
@@ -132,14 +131,10 @@ def render_case(case: AssuranceCase) -> Mapping[str, str]:
     """Render the files that are computed from the evidence: the case as JSON, its drawing, and the page."""
     drawing = draw_case(case.root)
     content = hide_folders(json.dumps(case.to_json(), indent=1, ensure_ascii=False)) + "\n"
-    page = page_environment().get_template("assurance.html.j2").render(_create_context(case, drawing))
-    return {CASE: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
-
-
-def _create_context(case: AssuranceCase, drawing: str) -> dict[str, Any]:
-    """Create the context of the page."""
     # the drawing escapes all texts
-    return {"case": case, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
+    context = {"case": case, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
+    page = page_environment().get_template("assurance.html.j2").render(context)
+    return {CASE: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
 
 
 def hash_program() -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.reports.dashboard.entries import Entry
 from marsyard.reports.robustness import Robustness
-from marsyard.reports.robustness_sentences import reach_text
+from marsyard.reports.robustness_section import reach_text
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
 from marsyard.reports.wording import NOTHING, percent
 
@@ -94,12 +94,9 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
                 studies.setdefault(entry.title, entry)
         line = sparkline(history[::-1])
         rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
-    return sorted(rows, key=_severity)
-
-
-def _severity(row: RequirementRow) -> int:
-    """Return the rank of a row by its latest verdict: failed requirements first, those without a campaign last."""
-    return len(Status) if row.latest is None else [*Status].index(row.latest.verdict.status)
+    # failed requirements first, those without a campaign last
+    order = {None: len(Status)} | {status: index for index, status in enumerate(Status)}
+    return sorted(rows, key=lambda row: order[row.latest.verdict.status if row.latest else None])
 
 
 def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from marsyard.reports import explorer
 from marsyard.reports.dashboard.site import read_script
-from marsyard.reports.page_scripts import script_hash
+from marsyard.reports.page_environment import script_hash
 
 #: Maximum number of connections at the same time; further ones are closed.
 MAX_CONNECTIONS = 64

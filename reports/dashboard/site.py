@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports.campaign import VERIFICATION_FILE
 from marsyard.reports.dashboard import entries as campaign_entries
 from marsyard.reports.dashboard.entries import Entry
-from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.dashboard.requirement_rows import (
     MAX_OTHER_VERDICTS,
     RequirementRow,
@@ -26,13 +27,47 @@ from marsyard.reports.dashboard.requirement_rows import (
     margin_text,
     requirement_rows,
 )
-from marsyard.reports.multiplicity import multiplicity_text
-from marsyard.reports.page_environment import page_environment
-from marsyard.reports.page_scripts import embed_json, script_hash
+from marsyard.reports.overall import multiplicity_text
+from marsyard.reports.page_environment import embed_json, page_environment, script_hash
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import read_cases
-from marsyard.reports.traceability import requirement_evidence, verification_csv
+from marsyard.reports.verdict_files import requirement_evidence, verification_csv
 from marsyard.reports.wording import NOTHING, percent
+
+#: First and last characters of the lists of cases, and of a case, in `templates/report.html.j2` and its parts.
+_LISTS = '<article class="lists">', "</article>"
+_CASE = '<article id="case-', "</article>"
+
+
+@dataclass(frozen=True)
+class Excerpts:
+    """Lists of cases by requirement (may be empty), and results and images of each case that the report shows."""
+
+    lists: Markup
+    cases: Mapping[int, Markup]
+
+
+def case_file(case: int) -> str:
+    """Return the name of the page of a case."""
+    return f"case-{case}.html"
+
+
+def read_excerpts(report: str) -> Excerpts:
+    """Read the parts of a report page; links to its cases become links to their pages."""
+    lists, parts = _read_parts(report, *_LISTS), _read_parts(report, *_CASE)
+    bodies = {int(head.partition('"')[0]): body for head, _, body in (part.partition(">") for part in parts)}
+
+    def link_pages(part: str) -> Markup:
+        for case in bodies:
+            part = part.replace(f'href="#case-{case}"', f'href="{case_file(case)}"')
+        return Markup(part)  # noqa: S704
+
+    return Excerpts(link_pages("".join(lists)), {case: link_pages(body) for case, body in bodies.items()})
+
+
+def _read_parts(report: str, start: str, end: str) -> list[str]:
+    return [part.partition(end)[0] for part in report.split(start)[1:]]
+
 
 INDEX = "index.html"
 _TEMPLATES = Path(__file__).parents[1] / "templates"

@@ -155,7 +155,7 @@ def _rectified_panel(
     """Create the panel of a rectified image with its templates (first image) or windows and matches (second image).
 
     `rectified_frame_<pair>` contains west and north edge and spacing of the lattice, metres; `gsd_<pair>` is the pixel
-    size of templates and windows, metres (`marsyard.algorithms.dimes.details`).
+    size of templates and windows, metres (`marsyard.algorithms.dimes.products`).
     """
     frame, gsd = check_shape(products.get(f"rectified_frame_{pair}"), 3), numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or frame is None:

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.interface import VelocityOutcome
-from marsyard.reports.cell_values import to_float
+from marsyard.reports.column_values import to_float
 from marsyard.reports.dimes import case_figures as figures
-from marsyard.reports.dimes.ignition_section import ignition_section
-from marsyard.reports.dimes.landing_section import landing_section
-from marsyard.reports.dimes.sensitivity_section import sensitivity_section
+from marsyard.reports.dimes.sections import ignition_section, landing_section, sensitivity_section
 from marsyard.reports.dimes.stream_case import STREAM_CASE
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
-from marsyard.reports.wording import NOTHING, label, number, percent
+from marsyard.reports.wording import NOTHING, label, note_text, number, percent
 
 #: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.
 _HIDDEN_COLUMNS = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
@@ -30,15 +28,6 @@ _HEADINGS = {
     "peak_width": "width of the peak (template px)",
     "second_peak_ratio": "second peak / first peak",
 }
-_LEGEND = (
-    "Top row: images rectified to a view from directly above, north up. Middle row, if there are templates: templates "
-    "and search windows, cut from the rectified images. Bottom row: {images} Squares in the bottom row mark "
-    "positions, not sizes. Positions in the table are pixels of the images in the bottom row, from 0 at the upper "
-    "left. Each velocity in the table is the mean between the two images of the pair. DIMES combines each valid track "
-    "of pair 1 with each valid track of pair 2. It selects the combination whose velocity change agrees best with "
-    "the IMU. It reports the velocity of the selected track of pair 2, the later pair. If the smallest difference "
-    "from the IMU is too large, no velocity is reported."
-)
 
 
 def view(products: Products, complete: bool = False) -> CaseView:
@@ -56,7 +45,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
         caption = f"Pair {pair + 1}: images {pair + 1} and {pair + 2}. {figures.describe_marks(products, pair)}"
         drawn.append(CaseFigure(f"pair{pair}", figures.draw_dimes_case(products, [pair]), caption, wide=False))
     head, rows = _create_track_table(products)
-    legend = _LEGEND.format(images=_describe_images(products))
+    legend = note_text("dimes.legend", images=_describe_images(products))
     return CaseView(drawn, [*facts, *_format_selection(products)], head, rows, legend)
 
 

@@ -17,25 +17,23 @@ from marsyard.reports.wording import note_text, number
 _MAX_PER_ROW = 10
 
 
-def _read_stream(products: Products) -> Float[np.ndarray, "n 6"] | None:
-    """Read a row for each image: start and end of the time span, estimate, truth (east, north); NaN if missing."""
+def _read_stream(products: Products) -> Float[np.ndarray, "n 6"]:
+    """Read a row for each image: start and end of the time span, estimate, truth (east, north); no row if missing."""
     names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
     parts = read_arrays(products, dict.fromkeys(names, ("n", 2)))
-    return np.concatenate(parts, axis=1) if parts is not None and len(parts[0]) else None
+    return np.empty((0, 6)) if parts is None else np.concatenate(parts, axis=1)
 
 
 def is_stream_case(products: Products) -> bool:
     """Whether products contain the answers of a velocity stream after each of its images."""
-    table = _read_stream(products)
-    return table is not None and all(
-        to_matrix(products.get(f"image_{index + 1}")) is not None for index in range(len(table))
-    )
+    images = [to_matrix(products.get(f"image_{index + 1}")) for index in range(len(_read_stream(products)))]
+    return bool(images) and all(image is not None for image in images)
 
 
 def view_stream(products: Products, _complete: bool = False) -> CaseView:
     """Create the view of a velocity stream: its images, and the estimate after each image."""
     rows = []
-    for image_number, row in enumerate(_require_stream(products), start=1):
+    for image_number, row in enumerate(_read_stream(products), start=1):
         is_answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
         rows.append(TableRow([str(image_number), *(values if is_answered else ["" for _ in values])], is_answered))
@@ -45,18 +43,10 @@ def view_stream(products: Products, _complete: bool = False) -> CaseView:
     return CaseView([CaseFigure("stream", draw_stream_case(products), caption)], head=head, rows=rows)
 
 
-def _require_stream(products: Products) -> Float[np.ndarray, "n 6"]:
-    """Read the velocity stream as in `_read_stream`. Raises ValueError if it is missing."""
-    table = _read_stream(products)
-    if table is None:
-        raise ValueError("the products contain no velocity stream")
-    return table
-
-
 @in_page_style
 def draw_stream_case(products: Products) -> Figure:
     """Draw the images in rows, and both components of the velocity after each image."""
-    table = _require_stream(products)
+    table = _read_stream(products)
     n_rows = -(-len(table) // _MAX_PER_ROW)
     figure = Figure(figsize=(12.0, 3.4 + 1.6 * n_rows), layout="constrained")
     cells = figure.add_gridspec(2, 1, height_ratios=(1.6 * n_rows, 3.4))

@@ -10,15 +10,9 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.interface import SiteOutcome
-from marsyard.reports.blocks import rate_block
-from marsyard.reports.cell_values import is_true, to_float
-from marsyard.reports.hda import answers
+from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
-from marsyard.reports.hda.classes import create_class_blocks
-from marsyard.reports.hda.faults_section import faults_section
-from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, landing_rows
-from marsyard.reports.hda.map_section import map_section
-from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
+from marsyard.reports.hda.paper_sections import limits_section, run_times_section, touchdown_section
 from marsyard.reports.hda.products import (
     is_hda_case,
     read_images,
@@ -27,12 +21,11 @@ from marsyard.reports.hda.products import (
     read_motion,
     read_tracked_features,
 )
-from marsyard.reports.hda.threshold_section import threshold_section
-from marsyard.reports.hda.tracking_limits import limits_section
+from marsyard.reports.hda.sections import faults_section, map_section, threshold_section
+from marsyard.reports.hda.sites_section import sites_section
 from marsyard.reports.images import draw_images
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products
-from marsyard.reports.section import Section, Subject, create_section
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
@@ -49,15 +42,6 @@ _UNKNOWN_TEXTS: Mapping[str, str] = {
     "fig5-maps": "The safe landing map is unknown everywhere: all its cells are close to a hole or to the border.",
     "fig7-site": "It is unknown everywhere.",
 }
-_LEGEND = (
-    "The layout follows Figs. 2 to 5 and 7 of the paper (Johnson, Montgomery and Matthies, vision guided landing). "
-    "Elevation: relative to the median of the map; high ground is dark. Roughness and slope: green is well below the "
-    "limit, yellow is near it, and red is above it. Safe landing map: green is safe, and red (hatched in Fig. 5) is a "
-    "hazard. Light blue is unknown in all maps. Cells near the border or near a hole are unknown. True slope, "
-    "roughness and safety are those of a lander footprint centred on each point, without hazard growth. They are "
-    "unknown if the images do not show the complete footprint. The a-priori site is set before the images are "
-    "processed."
-)
 #: This figure is only in files, since its images are those of Fig. 3.
 _OMITTED_FIGURE = "fig1-tracks"
 
@@ -133,27 +117,8 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
     return None
 
 
-def sites_section(subject: Subject) -> Section | None:
-    """Compare sites and hazards with the ground truth; None if the rows are not those of landings."""
-    frame = landing_rows(subject)
-    if frame is None:
-        return None
-    fractions = rate_block(
-        answers.site_fractions(frame), "Flights", "Fractions of correct answers", INTERVAL_NOTE, "fractions"
-    )
-    return create_section(
-        "sites",
-        "Sites",
-        "Sites and hazards compared with the ground truth",
-        answers.create_outcome_block(frame),
-        fractions,
-        answers.create_distance_block(frame),
-        *create_class_blocks(frame),
-    )
-
-
 HDA = Presentation(
-    cases=(CaseKind(is_hda_case, view, _LEGEND),),
+    cases=(CaseKind(is_hda_case, view, note_text("hda.legend")),),
     sections=(
         threshold_section, faults_section, limits_section, map_section, touchdown_section,
         sites_section, run_times_section,

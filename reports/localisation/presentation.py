@@ -5,20 +5,191 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
-from marsyard.reports.cell_values import to_float
-from marsyard.reports.localisation.case_figures import (
-    draw_errors,
-    draw_landmarks,
-    draw_map,
-    is_localisation_case,
-    read_track,
+from marsyard.reports.blocks import (
+    Quantity,
+    Rate,
+    collect_values,
+    condition_blocks,
+    distribution_block,
+    flag_rate,
+    quantile_block,
+    rate_block,
 )
-from marsyard.reports.localisation.sections import conditions_section, position_section
+from marsyard.reports.column_values import numbers, to_float
+from marsyard.reports.effects import scatter_block
+from marsyard.reports.figure_style import INK, MUTED, REQUIREMENT, SERIES, in_page_style
+from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
-from marsyard.reports.products import Products
+from marsyard.reports.products import Products, check_shape, read_arrays, to_matrix
+from marsyard.reports.rates import CaseFraction, fraction_of
+from marsyard.reports.section import Section, Subject, create_section, has_values
 from marsyard.reports.wording import number
+
+#: Required position error: the bound of a false fix.
+_MAX_POSITION_ERROR_M = 40.0
+_FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+#: Error of the published coarse stage, m.
+_MAX_COARSE_ERROR_M = 200.0
+
+
+def _compute_coarse_rate(frame: pd.DataFrame) -> CaseFraction:
+    """Return the fraction of descents with a correct coarse position; of no descent without a coarse stage."""
+    errors_m = numbers(frame, "coarse_error_m")
+    rows = frame if np.isfinite(errors_m).any() else frame[:0]
+    return fraction_of(numbers(rows, "coarse_error_m") <= _MAX_COARSE_ERROR_M, rows)
+
+
+_COARSE = Rate("coarse", "Coarse position within 200 m", _compute_coarse_rate)
+_FALSE_FIX = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
+_QUANTITIES = (
+    Quantity("coarse_error_m", "horizontal error of the coarse position (m)"),
+    Quantity("position_error_at_10_s_m", "horizontal position error after 10 s (m)"),
+    Quantity("position_error_m", "last horizontal position error (m)"),
+    Quantity("position_error_up_m", "last error of the height (m)"),
+    Quantity("velocity_error_m_s", "last velocity error (m/s)"),
+    Quantity("attitude_error_deg", "last attitude error (deg)"),
+    Quantity("fix_after_s", "time of the first reported position (s)"),
+    Quantity("inliers_median", "landmarks used in an image (median)"),
+    Quantity("inliers_min", "landmarks used in an image (minimum)"),
+    Quantity("image_time_max_s", "processor time of the slowest image (s)"),
+    Quantity("image_time_median_s", "processor time of an image (s, median)"),
+)
+_ERRORS = (
+    Quantity("position_error_at_10_s_m", "after 10 s"),
+    Quantity("position_error_m", "last"),
+    Quantity("position_error_world_m", "last, relative to the world"),
+)
+
+
+def position_section(subject: Subject) -> Section | None:
+    """Create the section on the position on the map; None for cases of another system."""
+    frame = subject.frame
+    if not has_values(frame, "fixed_in_time"):
+        return None
+    rates_by_name = {rate.name: rate.compute(frame) for rate in (_COARSE, _FIXED_IN_TIME, _FALSE_FIX)}
+    distribution = distribution_block(
+        "localisation",
+        collect_values(frame, _ERRORS),
+        ("horizontal position error (m)", "fraction of reported positions"),
+        "Cumulative distribution of the horizontal position error. The error relative to the world contains the map's "
+        "registration and distortion.",
+        "Position error",
+        bound=_MAX_POSITION_ERROR_M,
+    )
+    return create_section(
+        "localisation",
+        "Localisation",
+        "Position on the map",
+        rate_block(rates_by_name, "Descents", "Positions"),
+        distribution,
+        quantile_block(frame, _QUANTITIES, {"5 %": 0.05, "Median": 0.5, "95 %": 0.95, "99 %": 0.99}, "Distributions"),
+    )
+
+
+def conditions_section(subject: Subject) -> Section | None:
+    """Create the section on light and texture; None for cases of another system."""
+    frame = subject.frame
+    if not has_values(frame, "sun_difference_deg", "fixed_in_time"):
+        return None
+    blocks = condition_blocks(
+        frame,
+        "suns",
+        Quantity("sun_difference_deg", "Angle between the suns of map and landing (deg)"),
+        (_COARSE, _FIXED_IN_TIME, Rate("answered", "Position reported at the end", flag_rate("answered"))),
+        cases="Descents",
+        ylabel="fraction of descents",
+        caption="Descents with a reported position against the angle between the suns of map and landing.",
+    )
+    conditions = (
+        Quantity("sun_difference_deg", "angle between the suns (deg)"),
+        Quantity("image_contrast", "contrast of the first image"),
+        Quantity("initial_error_m", "initial position error (m)"),
+    )
+    responses = (
+        Quantity("position_error_m", "last horizontal position error (m)"),
+        Quantity("inliers_median", "landmarks used in an image"),
+    )
+    caption = "Position error and number of landmarks against the conditions."
+    causes = scatter_block(frame, "causes", conditions, responses, caption, "Causes")
+    return create_section("localisation-conditions", "Light", "Light and texture", *blocks, causes)
+
+
+_AXES = ("east", "north", "up")
+#: Enlargement of the landmarks' residuals.
+_RESIDUAL_SCALE = 20.0
+
+
+def is_localisation_case(products: Products) -> bool:
+    """Return whether products contain the track of a localisation case and its map, with the outcomes of the track."""
+    shapes = {"track": ("n", 7), "inliers": ("n",), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
+    arrays = read_arrays(products, shapes)
+    extent = read_arrays(products, {"map_extent_m": (4,)}, finite=True)
+    if arrays is None or extent is None or to_matrix(products.get("map")) is None:
+        return False
+    outcomes = products.get("outcomes")
+    names = [str(name) for name in outcomes] if isinstance(outcomes, list | tuple | np.ndarray) else []
+    return len(arrays[0]) == len(names) and set(names) <= set(PositionOutcome.__members__)
+
+
+def read_track(products: Products) -> Float[np.ndarray, "n 7"]:
+    """Read the track: time, errors east, north, up, and their standard deviations; NaN for a refusal."""
+    return np.asarray(products["track"], dtype=np.float64)
+
+
+@in_page_style
+def draw_errors(products: Products) -> Figure:
+    """Draw the position error of each component over time, with bands of three standard deviations."""
+    track = read_track(products)
+    valid = track[np.isfinite(track[:, 0])]
+    figure = Figure(figsize=(12.0, 3.2), layout="constrained")
+    for component, (name, axes) in enumerate(zip(_AXES, figure.subplots(1, 3), strict=True)):
+        band = 3.0 * valid[:, 4 + component]
+        axes.fill_between(valid[:, 0], -band, band, color=MUTED, alpha=0.25, linewidth=0.0)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        axes.plot(valid[:, 0], valid[:, 1 + component], marker="o", color=SERIES[component])
+        axes.set(xlabel="Time after the start (s)", ylabel=f"Position error {name} (m)")
+    return figure
+
+
+@in_page_style
+def draw_map(products: Products) -> Figure:
+    """Draw the map with true and estimated positions."""
+    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    extent = np.asarray(products["map_extent_m"], dtype=np.float64) / 1e3
+    axes.imshow(products["map"], cmap="gray", origin="lower", extent=tuple(extent), interpolation="antialiased")
+    true, estimated = (np.asarray(products[name], dtype=np.float64) / 1e3 for name in ("true_xy_m", "estimated_xy_m"))
+    initial = check_shape(products.get("initial_xy_m"), 2)
+    if initial is not None:
+        axes.plot(*initial / 1e3, marker="X", color=SERIES[3], linestyle="none", markersize=9.0, label="initial")
+    axes.plot(*true.T, color=SERIES[0], linewidth=3.0, label="true")
+    axes.plot(*estimated.T, marker="o", color=SERIES[1], linestyle="none", markersize=4.0, label="estimated")
+    axes.set(xlabel="East (km)", ylabel="North (km)")
+    axes.grid(visible=False)
+    axes.legend(frameon=True, facecolor="white", framealpha=1.0, labelcolor="black")
+    return figure
+
+
+def draw_landmarks(products: Products) -> Figure | None:
+    """Draw the last image with its landmarks and their residuals; None without landmarks."""
+    shapes = {"landmarks_px": ("n", 2), "landmarks_residual_px": ("n", 2), "landmarks_used": ("n",)}
+    arrays, image = read_arrays(products, shapes), to_matrix(products.get("image_2"))
+    if arrays is None or image is None:
+        return None
+    pixels, residuals, flags = arrays
+    used = flags > 0.5
+    marks = []
+    for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
+        style = {"marker": marker, "linestyle": "none", "markersize": 4.0, "fillstyle": "none"}
+        segments = np.stack([pixels[mask], pixels[mask] + _RESIDUAL_SCALE * residuals[mask]])
+        marks += [Mark(pixels[mask], style | {"color": colour}), Mark(segments, {"color": colour, "linewidth": 0.8})]
+    return draw_panels([[Panel(image, marks=marks)]], (6.0, 6.0))
+
 
 _LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
 

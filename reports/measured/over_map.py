@@ -10,7 +10,7 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView
 from marsyard.reports.products import Products, check_shape, to_matrix
-from marsyard.reports.wording import label, number
+from marsyard.reports.wording import label, note_text, number
 from marsyard.scenarios.measured.map_matching import MATCHERS
 from marsyard.scenarios.measured.over_map import RENDERED
 
@@ -22,19 +22,6 @@ STATISTICS = (
     "lvs_found_fraction", "lvs_correlation", "lvs_residual_px",
 )  # fmt: skip
 _NAMES = {"template": "templates", "sift": "SIFT", "orb": "ORB", "lvs": "landmarks"}
-_TEXT = (
-    "Each recorded image is matched with the map by four matchers; the rendered images have the same camera, heights, "
-    "attitudes, map pixels and compression, over other ground. The yield is the fraction of templates, features or "
-    "landmarks that are found at the right position; rank 1 is the matcher with the largest yield in an image. Medians "
-    "over images with a pose, in parentheses minimum and maximum. Where they differ, results of simulated campaigns "
-    "do not hold for such images."
-)
-_NOTE = (
-    "Images without a pose are not in the medians. Poses that are not measured are found by SIFT features, so that "
-    "images in which these fail are missing. The images of a sequence overlap and are not random samples, so these "
-    "numbers are not probabilities. "
-    "The recorded map can be larger than the rendered one, which makes its registration more difficult."
-)
 
 
 def map_section(subject: section.Subject) -> section.Section | None:
@@ -72,7 +59,11 @@ def map_section(subject: section.Subject) -> section.Section | None:
         "pose_error_px": _median(numbers(frame, f"{RENDERED}pose_error_px")),
     }
     grid = section.Grid(["Statistic", "Recorded", "Rendered"], rows)
-    blocks = [section.Block(text=_TEXT, figures=figures, grid=grid, note=_NOTE)]
+    blocks = [
+        section.Block(
+            text=note_text("measured.over_map_text"), figures=figures, grid=grid, note=note_text("measured.over_map")
+        )
+    ]
     return section.Section("over-map", "Map", "Recorded and rendered images over maps", blocks, data)
 
 

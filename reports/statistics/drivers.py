@@ -132,16 +132,23 @@ def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
     """Estimate the intraclass correlation (0 to 1) by analysis of variance; 0 if no group has two values."""
-    n, n_groups = values.size, sizes.size
-    if n_groups < 2 or n_groups == n:
+    if sizes.size < 2 or sizes.size == values.size:
         return 0.0
-    means = np.bincount(index, weights=values) / sizes
-    within = float(((values - means[index]) ** 2).sum()) / (n - n_groups)
-    between = float((sizes * (means - values.mean()) ** 2).sum()) / (n_groups - 1)
-    # the expectation of `between` is `within` + effective_size * (variance between groups)
-    effective_size = (n - float((sizes**2).sum()) / n) / (n_groups - 1)
+    within, between, effective_size = mean_squares(values, index)
     excess = between - within
     return float(np.clip(excess / (excess + effective_size * within), 0.0, 1.0)) if excess > 0.0 else 0.0
+
+
+def mean_squares(values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """Return the mean squares within and between at least two groups, and the effective number of values per group.
+
+    The expectation of the second is that of the first plus the effective number times the variance between groups.
+    """
+    sizes, n = np.bincount(index).astype(np.float64), values.size
+    means, degrees = np.bincount(index, weights=values) / sizes, sizes.size - 1
+    within = float(((values - means[index]) ** 2).sum()) / (n - sizes.size)
+    between = float((sizes * (means - values.mean()) ** 2).sum()) / degrees
+    return within, between, (n - float((sizes**2).sum()) / n) / degrees
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:

@@ -28,9 +28,8 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import max_statistic
+from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
 from marsyard.reports.statistics.proportions import Interval, check_confidence
-from marsyard.reports.statistics.terrain_sizes import count_sizes, event_scores, number_terrains
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
 _MAX_BOOTSTRAP = 2000

@@ -4,15 +4,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.algorithms.vtt.arm_target import HandOffOutcome
-from marsyard.reports.cell_values import is_true, to_float
+from marsyard.algorithms.vtt.arm import HandOffOutcome
+from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products
+from marsyard.reports.vtt.accuracy_sections import goal_section
 from marsyard.reports.vtt.case_figures import draw_path, draw_stops
 from marsyard.reports.vtt.case_products import is_vtt_case, read_rover_path, read_stops
-from marsyard.reports.vtt.goal import goal_section
-from marsyard.reports.vtt.sections import SECTIONS
-from marsyard.reports.vtt.updates_section import DEFINITIONS
+from marsyard.reports.vtt.paper_sections import DEFINITIONS, SECTIONS
 from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.rover.stops import RunOutcome
 

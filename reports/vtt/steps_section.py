@@ -13,19 +13,13 @@ from marsyard.reports import rates
 from marsyard.reports.plots import RateLine, rate_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
-from marsyard.reports.vtt.paper import PAPER, read_legs
-from marsyard.reports.vtt.run_selection import is_tracking, selectable_targets
+from marsyard.reports.vtt.tracking_runs import PAPER, is_tracking, read_legs, selectable_targets
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number
 
 #: Columns that distinguish the lines of the figure of steps: tracker, or side of the search window. The first column
 #: that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
-_OBLIQUITY_NOTE = (
-    "Obliquity: angle between the line of sight and the surface normal at the target; 0 is face-on. Rows are classes "
-    "of its maximum over the stops, columns are steps. Cells: tracked targets, of selectable targets. The template is "
-    "scaled and rolled, but not foreshortened like the image of an oblique patch, in the next image or the right one."
-)
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -71,7 +65,7 @@ def steps_section(subject: Subject) -> Section | None:
     blocks = [Block(text=motion["text"], figures=svg_figures), Block(grid=grid, note=_STEPS_NOTE)]
     oblique = _obliquity_grid(subject.frame, "%" if motion["per_cent"] else "deg")
     if oblique is not None:
-        blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=_OBLIQUITY_NOTE))
+        blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=note_text("vtt.obliquity")))
     return Section("steps", "Steps", motion["title"], blocks, {"cells": steps})
 
 

@@ -12,7 +12,7 @@ from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding, Suite
 from marsyard.scenarios.custom_algorithms import list_installed
 from marsyard.scenarios.imports import import_object
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.offline_algorithms import is_offline
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.rover.task import TRACKING

@@ -35,7 +35,7 @@ from marsyard.sim.sensor import (
     Readings,
     height_above_ground,
 )
-from marsyard.sim.sensor.radar import first_return
+from marsyard.sim.sensor.altimeters import first_return
 from marsyard.sim.streams import Streams
 
 

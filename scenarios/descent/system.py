@@ -10,7 +10,7 @@ _FOLDER = Path(__file__).resolve().parent
 
 def _camera_values(choices: Choices) -> dict[str, tuple[int, int]]:
     """Return the size to which DIMES bins the images of a user's camera."""
-    from marsyard.algorithms.dimes.binning import binned_size_for
+    from marsyard.algorithms.dimes.views import binned_size_for
     from marsyard.sim.camera import read_camera
 
     return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}

@@ -14,7 +14,7 @@ from marsyard.scenarios.fieldtest.triples import Category
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.render import Frame
-from marsyard.sim.sensor.ranging import height_above_ground
+from marsyard.sim.sensor.altimeters import height_above_ground
 from marsyard.sim.terrain import Surface
 
 #: Spacing of the grid on which cloud transmittance is evaluated, pixels.

@@ -23,15 +23,15 @@ from marsyard.algorithms.processes import adopt_orphans, descendants, end_with_p
 VERSION = 3
 
 
-def main(inputs: int) -> None:
-    """Serve requests until standard input ends; `inputs` is the descriptor of the shared memory."""
+def main(memory_fd: int) -> None:
+    """Serve requests until standard input ends; `memory_fd` is the descriptor of the shared memory."""
     _become_guarded()
     # the algorithm and its child processes do not inherit the descriptors of the exchange
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
-    os.set_inheritable(inputs, False)
+    os.set_inheritable(memory_fd, False)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)
-    host = Host(inputs)
+    host = Host(memory_fd)
     _write(answers, {"ready": True})
     for line in requests:
         request = json.loads(line)
@@ -77,8 +77,8 @@ def _guard(child: int) -> NoReturn:
 class Host:
     """The algorithm and its case: executes requests and creates answers."""
 
-    def __init__(self, inputs: int) -> None:
-        self._inputs = inputs
+    def __init__(self, memory_fd: int) -> None:
+        self._memory_fd = memory_fd
         self._factory: Any = None
         self._algorithm: Any = None
         self._receiver: Any = None
@@ -125,7 +125,7 @@ class Host:
         """Start a case: construct the algorithm, or reset it; return its members and whether each is a method."""
         from marsyard.scenarios.isolation.transport import Receiver
 
-        self._receiver, self._is_seeded = Receiver(self._inputs), False
+        self._receiver, self._is_seeded = Receiver(self._memory_fd), False
         if self._algorithm is None:
             self._algorithm = construct(self._load(path, spec), device)
         reset(self._algorithm)

@@ -11,15 +11,14 @@ import time
 import weakref
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
-from marsyard.algorithms.exchange.command import Command
 from marsyard.algorithms.exchange.forms import read_member
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.process import RunningProgram, temporary_folder
-from marsyard.algorithms.exchange.serving import acquire_server, release_server
+from marsyard.algorithms.exchange.serving import Command, acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.processes import children, processor_time_s
 from marsyard.algorithms.worker_device import worker_device
@@ -33,15 +32,15 @@ _MAX_TRACE = 8000
 
 
 class PythonProgram(RunningProgram):
-    """Process of a custom Python algorithm, with the descriptor of its shared memory (`memory`)."""
+    """Process of a custom Python algorithm, with the descriptor of its shared memory (`memory_fd`)."""
 
     def __init__(self, spec: str, limits: ExecutableLimits) -> None:
-        self.memory = os.memfd_create("measurements")
-        weakref.finalize(self, os.close, self.memory)
-        words = (sys.executable, "-P", "-m", "marsyard.scenarios.isolation.host", str(self.memory))
+        self.memory_fd = os.memfd_create("measurements")
+        weakref.finalize(self, os.close, self.memory_fd)
+        words = (sys.executable, "-P", "-m", "marsyard.scenarios.isolation.host", str(self.memory_fd))
         folder = temporary_folder()
         super().__init__(
-            words, limits, folder, working_folder=folder, readable=source_root(spec), descriptors=(self.memory,)
+            words, limits, folder, working_folder=folder, readable=source_root(spec), descriptors=(self.memory_fd,)
         )
 
     @property
@@ -84,7 +83,7 @@ class RemoteAlgorithm:
         self._server = acquire_server(command, limits)
         self._release = weakref.finalize(self, release_server, command, limits, self._server)
         child = cast(PythonProgram, self._server.child)
-        self._sender = Sender(child.memory)
+        self._sender = Sender(child.memory_fd)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
         child.left_s = math.inf
@@ -168,3 +167,38 @@ def absolute_spec(spec: str) -> str:
 def search_path() -> list[str]:
     """Return the folders in which this process finds modules; the current folder is the last."""
     return [*(folder for folder in sys.path if folder), str(Path.cwd())]
+
+
+@dataclass(frozen=True)
+class AlgorithmDescription:
+    """Description of the class or function that creates a custom algorithm.
+
+    - kind: name of its type
+    - members: names of its public members
+    - version, options: its attributes of these names, for the record of a campaign
+    """
+
+    kind: str
+    is_class: bool
+    is_callable: bool
+    members: frozenset[str]
+    version: str | None
+    options: Mapping[str, Any]
+
+
+@cache
+def describe_in_process(spec: str) -> AlgorithmDescription:
+    """Import a custom algorithm in a process of its own, and describe it. Raises ImportError with the reason."""
+    spec = absolute_spec(spec)
+    command, limits = PythonCommand(spec=spec), ExecutableLimits()
+    try:
+        server = acquire_server(command, limits)
+        request = {"do": "describe", "path": search_path(), "spec": spec}
+        answer, _ = server.send_request(request, limits.loading_s)
+    except AlgorithmError as error:
+        raise ImportError(f"{error.fault.name}: {error}") from error
+    server.child.stop()
+    if "error" in answer or "fault" in answer:
+        raise ImportError(str(answer.get("error", answer.get("message"))))
+    contents = {key: value for key, value in answer.items() if key != "exchange"}
+    return AlgorithmDescription(**{**contents, "members": frozenset(contents["members"])})

@@ -26,10 +26,10 @@ class Layout:
 
 
 class Sender:
-    """Writes the arguments of calls into shared memory. Create a new one for each case."""
+    """Writes the arguments of calls into shared memory (a file descriptor). Create a new one for each case."""
 
-    def __init__(self, memory: int) -> None:
-        self._memory = memory
+    def __init__(self, memory_fd: int) -> None:
+        self._memory_fd = memory_fd
         self._sent: list[Any] = []
 
     def send(self, arguments: tuple[Any, ...]) -> Layout:
@@ -44,7 +44,7 @@ class Sender:
         for block in blocks:
             view = memoryview(block).cast("B")
             while view.nbytes:
-                written = os.pwrite(self._memory, view, offset)
+                written = os.pwrite(self._memory_fd, view, offset)
                 view, offset = view[written:], offset + written
         return Layout([len(message) for message in pickles], [array.nbytes for array in arrays])
 
@@ -69,10 +69,10 @@ def _dump(value: Any, sent: list[Any] | None = None) -> tuple[bytes, list[pickle
 
 
 class Receiver:
-    """Reads the arguments of calls from shared memory. Create a new one for each case."""
+    """Reads the arguments of calls from shared memory (a file descriptor). Create a new one for each case."""
 
-    def __init__(self, memory: int) -> None:
-        self._memory = memory
+    def __init__(self, memory_fd: int) -> None:
+        self._memory_fd = memory_fd
         self._received: list[Any] = []
 
     def receive(self, layout: Layout) -> tuple[tuple[Any, ...], int | None]:
@@ -91,6 +91,6 @@ class Receiver:
     def _read(self, sizes: Sequence[int], offset: int) -> list[bytes]:
         blocks = []
         for size in sizes:
-            blocks.append(os.pread(self._memory, size, offset))
+            blocks.append(os.pread(self._memory_fd, size, offset))
             offset += size
         return blocks

@@ -17,7 +17,7 @@ from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
-from marsyard.sim.sensor.ranging import RangingUnit, range_along
+from marsyard.sim.sensor.altimeters import RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 

@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
 from marsyard.sim.dynamics import State, Trajectory, rotorcraft
 from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.sensor.gps import RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.helicopter_navigation import FilterState, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.imu import Imu
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.sensor.rtk import RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassReadings
 from marsyard.sim.streams import Streams
 

@@ -10,10 +10,10 @@ from pydantic import Field
 from marsyard.sim.dynamics import rotorcraft
 from marsyard.sim.error_sources import COMPASS, INERTIAL, RECEIVER
 from marsyard.sim.parameters import Parameters
+from marsyard.sim.sensor.gps import RtkParameters
 from marsyard.sim.sensor.helicopter_navigation import FilterParameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
-from marsyard.sim.sensor.rtk import RtkParameters
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters
 
 

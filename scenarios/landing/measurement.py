@@ -10,7 +10,7 @@ from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.measurements import LandingMeasurements
-from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
 
 

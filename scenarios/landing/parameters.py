@@ -14,7 +14,7 @@ from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.landing.faults import LandingFaults
 from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.site_parameters import (

@@ -23,7 +23,7 @@ from marsyard.scenarios.landing.products import case_products
 from marsyard.scenarios.landing.rendered_flight import RenderedFlight
 from marsyard.scenarios.landing.timeline import landing_timeline
 from marsyard.scenarios.landing.touchdown import simulate_touchdown
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.sim.streams import Streams
 

@@ -12,7 +12,7 @@ SYSTEM = System(
     title="Hazard detection and avoidance (HDA)",
     summary="A safe landing site from two images of a moving camera.",
     scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
-    tasks=("marsyard.scenarios.landing_site:LANDING",),
+    tasks=("marsyard.scenarios.landing_task:LANDING",),
     folder=_FOLDER,
     columns={"landing": "marsyard.scenarios.landing.columns:COLUMNS"},
     compilation_campaigns={"hda-benign": ("terrain.samples=512",)},

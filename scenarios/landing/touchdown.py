@@ -20,7 +20,7 @@ from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Transit
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.dynamics import Resting, State, rotorcraft
-from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
 
 #: Maximum number of iterations of a landing, and maximum change of the path at convergence, metres.
@@ -56,7 +56,7 @@ def simulate_touchdown(
     relief = truth.relief
     if flight.transit is None or estimate.site_world is None:
         return None
-    ground = rotorcraft.GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
+    ground = rotorcraft.GroundPatch(relief.west_m, relief.south_m, relief.spacing_m, relief.heights_m)
     unit = RangingUnit.draw(p.laser, streams.generator("laser"))
     return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
 

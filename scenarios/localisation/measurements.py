@@ -5,7 +5,7 @@ from typing import Any
 
 from marsyard.algorithms.answers import check_type
 from marsyard.algorithms.faults import bad_answer
-from marsyard.algorithms.localisation.answers import check_estimate
+from marsyard.algorithms.localisation.exchange import check_estimate
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements

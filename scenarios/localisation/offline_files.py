@@ -15,8 +15,8 @@ from marsyard.algorithms.exchange import files
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.scenarios.answer_tables import AnswerFormat
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.streamed import StreamAnswers
 
 

@@ -26,8 +26,8 @@ from marsyard.scenarios.views import render_state
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import ClockParameters, Detector, Imu
+from marsyard.sim.sensor.altimeters import RadarAltimeter
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.sensor.radar import RadarAltimeter
 from marsyard.sim.streams import Streams
 
 #: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The

@@ -28,7 +28,7 @@ from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.render import process_renderer
 from marsyard.sim.sensor import Detector, DetectorParameters
-from marsyard.sim.sensor.compression import MAX_BITS, MIN_BITS, compress_and_decompress
+from marsyard.sim.sensor.image_coding import MAX_BITS, MIN_BITS, compress_and_decompress
 from marsyard.sim.streams import Streams
 
 #: Largest side of a rendered map, pixels; fewest bits of a simulated detector.

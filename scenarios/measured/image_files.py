@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, UInt16
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from marsyard.scenarios.measured.layout import IngestError
-from marsyard.sim.camera.pds3_label import is_pds3
+from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.files import open_regular, read_npy_header, report_damage
 
 #: Number of first bytes that `read_header` reads.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.dimes.binning import binned_size_for
+from marsyard.algorithms.dimes.views import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header
@@ -33,7 +33,7 @@ from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_tables import format_problems
 from marsyard.sim.camera import CameraModel, LabelFrame, mount_looking_down, read_framed_cameras, read_pds3_product
-from marsyard.sim.camera.pds3_label import is_pds3
+from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.frames import compose
 
 #: Columns of a position.

@@ -17,7 +17,7 @@ from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.hda_stage_columns import motion_errors, stage_row
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images

@@ -16,11 +16,10 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.stats import rankdata
 
 from marsyard.algorithms.arrays import Points2
-from marsyard.algorithms.dimes import homography as orb
+from marsyard.algorithms.dimes import baselines as orb
 from marsyard.algorithms.image.correlation import normalized_correlation
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 from marsyard.algorithms.image.peaks import highest_peak
-from marsyard.algorithms.localisation.features import extract_map_features, flatten, match_descriptors
 from marsyard.algorithms.localisation.fine import LandmarkMatches, match_landmarks
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.landmarks import select_landmarks
@@ -28,6 +27,7 @@ from marsyard.algorithms.localisation.map_sampling import elevation_at, map_pixe
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.algorithms.localisation.rectification import rectify_patches, view_ground
+from marsyard.algorithms.localisation.sift_pose import extract_map_features, flatten, match_descriptors
 from marsyard.scenarios.interface import Scalar
 
 #: Matchers, in the order of their ranks if their yields are equal.

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.localisation.features import FeaturePose, MapFeatures, flatten, register_image
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.map_sampling import elevation_at, inside_map
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
+from marsyard.algorithms.localisation.sift_pose import FeaturePose, MapFeatures, flatten, register_image
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import read_counts, read_elevation
 from marsyard.scenarios.measured.layout import IngestError, MapTable

@@ -12,7 +12,7 @@ SYSTEM = System(
         "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
         "measured-map": "marsyard.scenarios.measured.over_map:OverMapScenario",
     },
-    tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),
+    tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_task:LANDING"),
     columns={
         "measured-velocity": "marsyard.scenarios.measured.columns:VELOCITY_COLUMNS",
         "measured-landing": "marsyard.scenarios.measured.columns:LANDING_COLUMNS",

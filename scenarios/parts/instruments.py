@@ -23,7 +23,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import UNIT_TOLERANCE
 from marsyard.scenarios.parts.named import INSTRUMENT, CustomPart
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.sensor.ranging import DOWN
+from marsyard.sim.sensor.altimeters import DOWN
 
 #: Shape of one reading by measured quantity.
 QUANTITIES: Mapping[str, tuple[int, ...]] = {"altitude": (), "attitude": (4,)}

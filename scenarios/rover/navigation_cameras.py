@@ -23,8 +23,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose, rigid
 from marsyard.sim.measurements import MastCalibration, StereoMeasurement
 from marsyard.sim.sensor import Detector, natural_fall_off, preset
-from marsyard.sim.sensor.mast import stereo_mast
-from marsyard.sim.sensor.stereo_head import StereoHead
+from marsyard.sim.sensor.mast import StereoHead, stereo_mast
 from marsyard.sim.streams import Streams
 
 #: Presets of the mast's navigation cameras; keys: presets of the tracking cameras.

@@ -26,9 +26,8 @@ from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive,
 from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import AutoExposureParameters, CustomCameraChoice, DetectorChoice, DetectorParameters, preset
-from marsyard.sim.sensor.mast import MASTS, PointingParameters, stereo_mast
+from marsyard.sim.sensor.mast import MASTS, PointingParameters, StereoCalibrationParameters, mount_on_head, stereo_mast
 from marsyard.sim.sensor.odometry import OdometryParameters
-from marsyard.sim.sensor.stereo_head import StereoCalibrationParameters, mount_on_head
 from marsyard.sim.terrain import MAX_TERRAINS, PhotometryChanges, Site, site
 
 #: Angles in degrees: relative angles, and azimuths.

@@ -7,14 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Points3
-from marsyard.algorithms.vtt.placement import (
-    Instrument,
-    Placement,
-    PlacementOutcome,
-    measure_surface,
-    place_instrument,
-    tool_overlap_m,
-)
+from marsyard.algorithms.vtt.arm import Placement, PlacementOutcome, measure_surface, place_instrument, tool_overlap_m
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.points import Vector, enclosing_spheres, ray_distances, sight_axes, spheres_near_line
 from marsyard.scenarios.rover.run_state import RoverRun
@@ -85,7 +78,7 @@ def placement_row(run: RoverRun) -> dict[str, Scalar]:
     position = np.asarray(world_from_rover.apply(placement.position_rover.copy()))
     normal = np.asarray(world_from_rover.rotation.apply(placement.normal_rover.copy()))
     viewpoint = run.setup.rig.camera_positions(stop.world_from_head)[0]
-    overlap_m = tool_overlap_m(sample_surface(run, viewpoint), position, normal, Instrument())
+    overlap_m = tool_overlap_m(sample_surface(run, viewpoint), position, normal)
     error_m = float(np.linalg.norm(position - run.target.point_world))
     return {
         "placed": True,

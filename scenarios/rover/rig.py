@@ -11,8 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastCalibration
-from marsyard.sim.sensor.mast import Mast, MastState
-from marsyard.sim.sensor.stereo_head import StereoHead
+from marsyard.sim.sensor.mast import Mast, MastState, StereoHead
 from marsyard.sim.streams import Streams
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.algorithms.vtt.placement import Placement
+from marsyard.algorithms.vtt.arm import Placement
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.designation import DesignatedTarget
 from marsyard.scenarios.rover.flight_software import Navigator, TargetEstimate

@@ -9,18 +9,16 @@ from marsyard.sim.camera.base import CameraModel, camera_pose, mount_looking_dow
 from marsyard.sim.camera.cahvore import Cahvore
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
 from marsyard.sim.camera.camera_files import read_camera, read_cameras, read_framed_cameras
+from marsyard.sim.camera.file_reading import CameraFileError
 from marsyard.sim.camera.jpl_files import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
 from marsyard.sim.camera.label_frames import FramedCamera, LabelFrame
 from marsyard.sim.camera.models import Cahv, Cahvor
 from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
-from marsyard.sim.camera.pds3 import read_pds3
-from marsyard.sim.camera.pds3_products import Pds3Product, read_pds3_product
-from marsyard.sim.camera.pds4 import read_pds4
-from marsyard.sim.camera.source import CameraFileError
+from marsyard.sim.camera.pds3 import Pds3Product, read_pds3_product
 
 __all__ = [
     "BODY_FRAME", "HEAD_FRAME", "Cahv", "Cahvor", "Cahvore", "Calibration", "CameraFileError", "CameraModel",
     "FramedCamera", "LabelFrame", "Pds3Product", "Residual", "camera_pose", "from_opencv", "from_opencv_fisheye",
     "mount_looking_down", "read_cahvor", "read_calibrations", "read_camera", "read_cameras", "read_framed_cameras",
-    "read_pds3", "read_pds3_product", "read_pds4", "write_cahvor",
+    "read_pds3_product", "write_cahvor",
 ]  # fmt: skip

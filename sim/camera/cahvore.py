@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from marsyard.sim.camera import kernels
 from marsyard.sim.camera.base import Components, Number, Vector, Vector3Like, dot
 from marsyard.sim.camera.models import Cahv, RadialModel
 
@@ -164,7 +163,7 @@ class Cahvore(RadialModel):
     def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
         axial, lateral, radius = self._split_at_axis(*self._compute_linear_directions(u, v))
         distorted_chi = radius / np.where(axial > 0, axial, np.nan)
-        ratio = kernels.compute_undistortion_ratios(self._polynomial, self._limits, distorted_chi * distorted_chi)
+        ratio = self._compute_undistortion_ratios(distorted_chi * distorted_chi)
         theta = self._theta_from_chi(distorted_chi * ratio)
         theta = np.where(theta < self._theta_limit, theta, np.nan)
         sine, cosine = np.sin(theta), np.cos(theta)

@@ -9,16 +9,15 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.sim.camera.source import CALIBRATION_FILES, Source
-from marsyard.sim.camera.xml_files import parse_xml
+from marsyard.sim.camera.file_reading import CALIBRATION_FILES, Source, parse_xml
 
 Values = Mapping[str, Any]
 
 #: Root element of OpenCV's files.
 OPENCV_ROOT = "opencv_storage"
 #: First line of a camera in COLMAP's file, after comments; start of a camera of Ames Stereo Pipeline.
-_COLMAP = re.compile(rb"\A(?:\s*#[^\n]*\n|\s*\n)*\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]")
-_PINHOLE = re.compile(rb"\A\s*VERSION_\d+\s+PINHOLE\b")
+COLMAP = re.compile(rb"\A(?:\s*#[^\n]*\n|\s*\n)*\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]")
+STEREO_PIPELINE = re.compile(rb"\A\s*VERSION_\d+\s+PINHOLE\b")
 #: Names of the parameters of COLMAP's models, and whether the model is a fisheye's.
 _COLMAP_MODELS: dict[str, tuple[str, bool]] = {
     "SIMPLE_PINHOLE": ("f cx cy", False),
@@ -32,18 +31,8 @@ _COLMAP_MODELS: dict[str, tuple[str, bool]] = {
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", True),
 }
 #: Axes of the image of Ames Stereo Pipeline that are OpenCV's.
-_PINHOLE_AXES = {"u_direction": (1.0, 0.0, 0.0), "v_direction": (0.0, 1.0, 0.0), "w_direction": (0.0, 0.0, 1.0)}
+_AXES = {"u_direction": (1.0, 0.0, 0.0), "v_direction": (0.0, 1.0, 0.0), "w_direction": (0.0, 0.0, 1.0)}
 _ASSIGNMENT = re.compile(r"^\s*(?P<name>\w+)\s*=\s*(?P<value>.*?)\s*$")
-
-
-def is_colmap(head: bytes) -> bool:
-    """Return whether the first bytes are those of COLMAP's `cameras.txt`."""
-    return _COLMAP.match(head) is not None
-
-
-def is_stereo_pipeline(head: bytes) -> bool:
-    """Return whether the first bytes are those of a pinhole model of Ames Stereo Pipeline (`.tsai`)."""
-    return _PINHOLE.match(head) is not None
 
 
 def read_opencv_xml(source: Source) -> Values:
@@ -109,7 +98,7 @@ def read_stereo_pipeline(source: Source, size: tuple[int, int] | None) -> Values
         raise source.error("lens model", f"{lens!r}", "NULL or TSAI")
     if size is None:
         raise source.error("size", "missing: the file does not contain it", "size = [columns, rows]")
-    for name, axis in _PINHOLE_AXES.items():
+    for name, axis in _AXES.items():
         if tuple(_parse_numbers(source, name, terms.get(name, "").split())) != axis:
             raise source.error(name, f"{terms.get(name, 'missing')!r}", " ".join(f"{number:g}" for number in axis))
 

@@ -24,17 +24,15 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.calibration_formats import (
+    COLMAP,
     OPENCV_ROOT,
-    is_colmap,
-    is_stereo_pipeline,
+    STEREO_PIPELINE,
     read_colmap,
     read_opencv_xml,
     read_stereo_pipeline,
 )
-from marsyard.sim.camera.foreign_formats import refuse_foreign
+from marsyard.sim.camera.file_reading import CALIBRATION_FILES, Source, is_xml, refuse_foreign, xml_root
 from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
-from marsyard.sim.camera.source import CALIBRATION_FILES, Source
-from marsyard.sim.camera.xml_files import is_xml, xml_root
 
 #: Maximum residual of the fitted camera: RMS over the frame, similar to the residual of a calibration (0.1 to 0.5 px);
 #: and at any pixel (the maximum is in a corner).
@@ -96,7 +94,7 @@ def is_calibration(head: bytes) -> bool:
     """Return whether a file with these first bytes can be a calibration."""
     if is_xml(head):
         return xml_root(head) == OPENCV_ROOT
-    return is_colmap(head) or is_stereo_pipeline(head) or _START.match(head) is not None
+    return any(start.match(head) for start in (COLMAP, STEREO_PIPELINE, _START))
 
 
 def read_calibrations(path: str | Path, *, size: tuple[int, int] | None = None) -> tuple[Calibration, ...]:
@@ -112,12 +110,12 @@ def read_calibrations(path: str | Path, *, size: tuple[int, int] | None = None) 
     refuse_foreign(source, head)
     if is_xml(head):
         return (_Reader(source, read_opencv_xml(source), "").read_calibration("", None),)
-    if is_colmap(head):
+    if COLMAP.match(head):
         return tuple(
             _Reader(source, values, f"camera {name}: ").read_calibration(name, None)
             for name, values in read_colmap(source)
         )
-    if is_stereo_pipeline(head):
+    if STEREO_PIPELINE.match(head):
         return (_Reader(source, read_stereo_pipeline(source, size), "").read_calibration("", None),)
     text = source.read_text().encode("latin-1").decode("utf-8-sig", errors="replace")
     try:

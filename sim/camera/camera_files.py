@@ -4,14 +4,11 @@ from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.calibrations import HEAD_BYTES, is_calibration, read_calibrations
-from marsyard.sim.camera.foreign_formats import refuse_foreign
+from marsyard.sim.camera.file_reading import FORMATS, Source, is_xml, refuse_foreign, xml_root
 from marsyard.sim.camera.jpl_files import read_cahvor
 from marsyard.sim.camera.label_frames import ROVER_FRAME, FramedCamera
-from marsyard.sim.camera.pds3 import read_pds3_framed
-from marsyard.sim.camera.pds3_label import is_pds3
-from marsyard.sim.camera.pds4 import read_pds4_framed
-from marsyard.sim.camera.source import FORMATS, Source
-from marsyard.sim.camera.xml_files import is_xml, xml_root
+from marsyard.sim.camera.pds3 import is_pds3, read_pds3
+from marsyard.sim.camera.pds4 import read_pds4
 
 #: Start of the names of root elements of PDS4 labels.
 _PDS4_ROOT = "Product_"
@@ -22,11 +19,11 @@ def read_cameras(
 ) -> tuple[CameraModel, ...]:
     """Detect the format of a file and read every camera model in it.
 
-    Formats: a PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), a
-    calibration of OpenCV, ROS, Kalibr, EuRoC, COLMAP or Ames Stereo Pipeline (`read_calibrations`, which also reports
-    the residuals).
+    Formats: a PDS3 label or product, a PDS4 label, a JPL text file (`read_cahvor`), or a calibration of OpenCV, ROS,
+    Kalibr, EuRoC, COLMAP or Ames Stereo Pipeline (`read_calibrations`, which also reports the residuals).
 
-    - subframe_folded_in: accept PDS labels of subframes and averaged pixels, see `read_pds3`
+    - subframe_folded_in: accept PDS labels of subframes and averaged pixels; the vectors are assumed to describe the
+      stored image
     - size: (columns, rows) of the image, required for files that do not contain it: JPL text files without the line
       Dimensions, and models of Ames Stereo Pipeline
 
@@ -49,7 +46,7 @@ def read_framed_cameras(
     source = Source(str(path))
     leading_bytes = source.read_head(HEAD_BYTES)
     if is_pds3(leading_bytes):
-        return read_pds3_framed(path, subframe_folded_in=subframe_folded_in)
+        return read_pds3(path, subframe_folded_in=subframe_folded_in)
     refuse_foreign(source, leading_bytes)
     if is_calibration(leading_bytes):
         calibrations = read_calibrations(path, size=size)
@@ -58,7 +55,7 @@ def read_framed_cameras(
         root = xml_root(leading_bytes)
         if not root.startswith(_PDS4_ROOT):
             raise source.error("file", f"is XML with the root element {root!r}", FORMATS)
-        return read_pds4_framed(path, subframe_folded_in=subframe_folded_in)
+        return read_pds4(path, subframe_folded_in=subframe_folded_in)
     if b"\0" in leading_bytes:
         raise source.error("file", "is binary and no PDS3 product", FORMATS)
     return (FramedCamera(read_cahvor(path, size=size), ROVER_FRAME),)

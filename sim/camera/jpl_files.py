@@ -18,7 +18,7 @@ from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.cahvore import Cahvore
-from marsyard.sim.camera.source import FORMATS, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.file_reading import FORMATS, Source, create_camera, linearity_of_type
 
 #: Names of lines in a JPL text file, of which a file in this format has at least one.
 _LINES = ("Model", "Dimensions", "C", "A", "H", "V")

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.source import Source
+from marsyard.sim.camera.file_reading import Source
 from marsyard.sim.frames import compose, rigid
 
 SITE, LOCAL_LEVEL, MARS_FIXED = "SITE", "LOCAL_LEVEL", "MCMF"

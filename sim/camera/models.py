@@ -13,12 +13,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from marsyard.sim.camera import kernels
 from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Components, Number, Vector, Vector3Like, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 #: A chi^2 above this is treated as infinite.
 _INFINITE_TAU = 1e30
+#: Maximum number of Newton steps, and relative step that ends the iteration; the remaining error is about step**2.
+_NEWTON_STEPS, _STEP_TOLERANCE = 12, 1e-9
+#: Steps of the bisection if Newton's method fails: more than the 53 bits of a float's mantissa.
+_BISECTION_STEPS = 70
 
 
 @final
@@ -194,6 +197,46 @@ class RadialModel(CameraModel):
             return np.inf, np.inf
         return float(tau), float(tau * (k1 + tau * (k3 + tau * k5)) ** 2)
 
+    def _compute_undistortion_ratios(self, distorted_tau: Vector) -> Vector:
+        """Compute the ratios g = chi / f(chi) for values tau of f(chi)^2; NaN beyond the range of f.
+
+        Each solves g (k1 + s (k3 + s k5)) = 1 with s = tau g^2, and is finite on the axis. Newton's method starts at
+        g = 1 / k1; bisection follows for the values for which it fails.
+        """
+        k1, k3, k5 = self._polynomial
+        ratio = np.full_like(distorted_tau, 1.0 / k1)
+        is_valid = distorted_tau < self._limits[1]
+        is_moving = is_valid.copy()
+        for _ in range(_NEWTON_STEPS):
+            s = distorted_tau * ratio * ratio
+            step = (ratio * (k1 + s * (k3 + s * k5)) - 1.0) / (k1 + s * (3.0 * k3 + s * (5.0 * k5)))
+            ratio = np.where(is_moving, ratio - step, ratio)
+            is_moving &= ~(np.abs(step) <= _STEP_TOLERANCE * ratio)
+            if not is_moving.any():
+                break
+        max_ratio = np.sqrt(self._limits[0] / distorted_tau)
+        has_failed = is_valid & (is_moving | ~((ratio > 0.0) & (ratio <= max_ratio)))
+        if has_failed.any():
+            ratio[has_failed] = self._bisect_ratios(distorted_tau[has_failed], max_ratio[has_failed])
+        return np.where(is_valid, ratio, np.nan)
+
+    def _bisect_ratios(self, distorted_tau: Vector, max_ratio: Vector) -> Vector:
+        """Solve the equation of `_compute_undistortion_ratios` by bisection between 0 and a maximum or infinity."""
+        k1, k3, k5 = self._polynomial
+
+        def is_not_above(ratio: Vector) -> NDArray[np.bool_]:
+            s = distorted_tau * ratio * ratio
+            return np.asarray(ratio * (k1 + s * (k3 + s * k5)) <= 1.0)
+
+        low, high = np.zeros_like(max_ratio), np.where(np.isfinite(max_ratio), max_ratio, 1.0)
+        while np.any(is_below := is_not_above(high) & np.isinf(max_ratio)):
+            high = np.where(is_below, 2.0 * high, high)
+        for _ in range(_BISECTION_STEPS):
+            middle = 0.5 * (low + high)
+            is_low = is_not_above(middle)
+            low, high = np.where(is_low, middle, low), np.where(is_low, high, middle)
+        return 0.5 * (low + high)
+
     def _split_at_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Components, Vector]:
         """Split P - C into its component along O and the vector lambda perpendicular to O; third value: its length."""
         axial = dot(self._axis, x, y, z)
@@ -254,10 +297,16 @@ class Cahvor(RadialModel):
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
 
     def _compute_pixels(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        pixels: tuple[Vector, Vector, NDArray[np.bool_]] = kernels.project_radial(
-            (x, y, z), self._axis, (self.h, self.v, self.a), self._axis_image, self.r, self._limits[0]
+        omega = dot(self._axis, x, y, z)
+        tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1.0, 0.0)
+        mu = self.r[0] + tau * (self.r[1] + tau * self.r[2])
+        column, row, depth = (
+            undistorted + mu * (undistorted - image * omega)
+            for image, undistorted in zip(
+                self._axis_image, (dot(vector, x, y, z) for vector in (self.h, self.v, self.a)), strict=True
+            )
         )
-        return pixels
+        return column / depth, row / depth, (omega > 0.0) & (tau < self._limits[0]) & (depth > 0.0)
 
     def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Components, Components]:
         omega = dot(self._axis, x, y, z)
@@ -272,7 +321,8 @@ class Cahvor(RadialModel):
         return self._radial_gradient(lateral, kappa, (kappa_x, kappa_y, kappa_z))
 
     def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
-        direction: Components = kernels.compute_ray_directions(
-            u, v, self._direction_from_pixel, self._axis, self._polynomial, self._limits
-        )
-        return direction, None
+        axial, (x, y, z), _ = self._split_at_axis(*self._compute_linear_directions(u, v))
+        tau = (x * x + y * y + z * z) / (axial * axial)
+        ratio = self._compute_undistortion_ratios(np.where(axial > 0.0, tau, np.nan))
+        direction = [axial * self._axis[i] + ratio * lateral for i, lateral in enumerate((x, y, z))]
+        return (direction[0], direction[1], direction[2]), None

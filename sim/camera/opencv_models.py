@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -211,20 +212,10 @@ def _invert_pinhole_distortion(distorted_points: Array, coefficients: Array) -> 
 
 def _apply_pinhole_distortion(points: Array, coefficients: Array) -> tuple[Array, Array]:
     """Apply OpenCV's pinhole distortion to (x, y), shape (n, 2); return also its derivative, shape (n, 2, 2)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
-    x, y = points.T
-    r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    gain = numerator / denominator
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-    mixed_derivative = 2 * (x * y * slope + p1 * x + p2 * y)
-    distorted_points = np.stack(
-        [x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * gain + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1
-    )
-    derivative_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed_derivative], axis=-1)
-    derivative_y = np.stack([mixed_derivative, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
-    return distorted_points, np.stack([derivative_x, derivative_y], axis=-2)
+    rays = np.column_stack([points, np.ones(len(points))])
+    distorted, jacobian = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
+    # columns of the Jacobian: rotation, then translation; on the plane z = 1 a translation along x or y moves the point
+    return distorted.reshape(-1, 2), jacobian.reshape(len(points), 2, -1)[..., 3:5]
 
 
 def _compute_fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:

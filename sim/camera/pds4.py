@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.file_reading import MODELS, SUBFRAME, Source, create_camera, linearity_of_type, parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,
@@ -18,8 +19,6 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
-from marsyard.sim.camera.source import MODELS, SUBFRAME, Source, create_camera, linearity_of_type
-from marsyard.sim.camera.xml_files import parse_xml
 
 #: Names in the geometry dictionary.
 _PARAMETERS = "Camera_Model_Parameters"
@@ -43,22 +42,16 @@ _FORWARD, _REVERSE = "Forward", "Reverse"
 _IDENTIFIER = re.compile(r"(?P<name>[A-Za-z]\w*?)(?P<indices>(?:_\d+)+)(?:_[A-Za-z]+)?")
 
 
-def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
-    """Read every camera model of a PDS4 label (.xml or .lblx), in order.
+def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
+    """Read every camera model of a PDS4 label (.xml or .lblx), in order, in the frames that `read_pds3` chooses.
 
     Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the image. With
     `subframe_folded_in` such images are accepted, and the vectors are assumed to describe the stored image, as in the
-    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted. Models are
-    returned in the frame that `read_pds4_framed` chooses.
+    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted.
     """
-    return tuple(framed.camera for framed in read_pds4_framed(path, subframe_folded_in=subframe_folded_in))
-
-
-def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
-    """Read every camera model as `read_pds4` does, with its frame as `read_pds3_framed` does."""
     source = Source(str(path))
     root = parse_xml(source, "a PDS4 label")
-    models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
+    models = [model for model in _find_elements(root, _PARAMETERS) if model.find("{*}model_type") is not None]
     if not models:
         raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")
     size = _read_size(root, source)
@@ -69,7 +62,7 @@ def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> t
     return tuple(
         resolve_camera(
             _create_pds4_camera(element, size, source),
-            _read_frame(_find_child(element, reference), identified, None) or ROVER_FRAME,
+            _read_frame(element.find(f"{{*}}{reference}"), identified, None) or ROVER_FRAME,
             systems,
             f"{_PARAMETERS}.{reference}",
             source,
@@ -85,7 +78,7 @@ def _read_size(root: ElementTree.Element, source: Source) -> tuple[int, int]:
         raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
     extents = {}
     for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
-        axis_name, count = _element_text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
+        axis_name, count = _element_text(axis.find("{*}axis_name")), axis.find("{*}elements")
         if axis_name in ("Line", "Sample") and count is not None:
             if not (_element_text(count).isdecimal() and int(_element_text(count)) > 0):
                 raise source.error("Axis_Array.elements", f"{_element_text(count)!r}", "a positive integer")
@@ -112,15 +105,15 @@ def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[Coord
     for element in _find_elements(root, "Coordinate_Space_Definition"):
         identifiers = [_element_text(child) for child in element if _local_name(child) == "local_identifier"]
         default = _parse_identifier(identifiers[0]) if identifiers else None
-        frame = _read_frame(_find_child(element, "Coordinate_Space_Present"), {}, default)
+        frame = _read_frame(element.find("{*}Coordinate_Space_Present"), {}, default)
         if frame is not None:
             identified |= dict.fromkeys(identifiers, frame)
             definitions.append((element, frame))
     systems = []
     for element, frame in definitions:
-        reference = _read_frame(_find_child(element, "Coordinate_Space_Reference"), identified, None)
+        reference = _read_frame(element.find("{*}Coordinate_Space_Reference"), identified, None)
         offset, rotation = (
-            _find_child(element, name) for name in ("Vector_Origin_Offset", "Quaternion_Plus_Direction")
+            element.find(f"{{*}}{name}") for name in ("Vector_Origin_Offset", "Quaternion_Plus_Direction")
         )
         if reference is None or offset is None or rotation is None:
             continue  # not the definition of a transform
@@ -129,12 +122,12 @@ def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[Coord
             _parse_number(parent, part, f"{field}.{part}", source)
             for parent, parts in ((offset, _POSITION), (rotation, _QUATERNION))
             for part in parts
-            if _element_text(_find_child(parent, part))
+            if _element_text(parent.find(f"{{*}}{part}"))
         ]
         if len(numbers) < len(_POSITION + _QUATERNION):
             continue  # without values, for example of an arm that was not measured
-        units = {getattr(_find_child(offset, part), "attrib", {}).get("unit") for part in _POSITION}
-        direction = _element_text(_find_child(rotation, "rotation_direction")) or _FORWARD
+        units = {getattr(offset.find(f"{{*}}{part}"), "attrib", {}).get("unit") for part in _POSITION}
+        direction = _element_text(rotation.find("{*}rotation_direction")) or _FORWARD
         if not units <= set(_PDS4_METRES):
             raise source.error(f"{field}.Vector_Origin_Offset", f"is in {units}", "metres (unit m)")
         if direction not in (_FORWARD, _REVERSE):
@@ -168,17 +161,13 @@ def _parse_identifier(identifier: str) -> LabelFrame:
     return LabelFrame.of(match["name"], [int(index) for index in match["indices"].split("_")[1:]])
 
 
-def _local_name(element: ElementTree.Element) -> str:
-    """Return an element's name without its namespace."""
-    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
-
-
 def _find_elements(element: ElementTree.Element, *names: str) -> list[ElementTree.Element]:
+    """Return the descendants with these names in any namespace, in the order of the label."""
     return [descendant for descendant in element.iter() if _local_name(descendant) in names]
 
 
-def _find_child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
-    return next((child for child in element if _local_name(child) == name), None)
+def _local_name(element: ElementTree.Element) -> str:
+    return element.tag.rpartition("}")[2]
 
 
 def _element_text(element: ElementTree.Element | None) -> str:
@@ -187,17 +176,17 @@ def _element_text(element: ElementTree.Element | None) -> str:
 
 def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
     """Create the camera of a class `Camera_Model_Parameters`. Raises CameraFileError."""
-    name = _element_text(_find_child(element, "model_type"))
+    name = _element_text(element.find("{*}model_type"))
     if name not in MODELS:
         raise source.error(f"{_PARAMETERS}.model_type", f"{name!r}", ", ".join(MODELS))
     class_name = f"{name}_Model"
-    model = _find_child(element, class_name)
+    model = element.find(f"{{*}}{class_name}")
     if model is None:
         raise source.error(f"{_PARAMETERS}.{class_name}", "missing", "the class that belongs to the model_type")
     vectors: dict[str, list[float]] = {}
     for letter in name:
         vector_name, parts = _VECTORS[letter]
-        vector, field = _find_child(model, vector_name), f"{class_name}.{vector_name} ({letter})"
+        vector, field = model.find(f"{{*}}{vector_name}"), f"{class_name}.{vector_name} ({letter})"
         if vector is None:
             raise source.error(field, "missing", "every vector of the model")
         vectors[letter] = []
@@ -205,7 +194,7 @@ def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], sou
             number = _parse_number(vector, part, f"{field}.{part}", source)
             if number is None:
                 raise source.error(f"{field}.{part}", "missing", "a finite number")
-            unit = getattr(_find_child(vector, part), "attrib", {}).get("unit")
+            unit = getattr(vector.find(f"{{*}}{part}"), "attrib", {}).get("unit")
             if parts is _POSITION and unit not in _PDS4_METRES:
                 raise source.error(f"{field}.{part}", f"is in {unit!r}", "metres (unit m)")
             vectors[letter].append(number)
@@ -219,7 +208,7 @@ def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], sou
 
 
 def _parse_number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
-    child = _find_child(element, name)
+    child = element.find(f"{{*}}{name}")
     if child is None:
         return None
     try:

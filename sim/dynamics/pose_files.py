@@ -17,7 +17,7 @@ Quaternions rotate from the body's axes to the world's. Except for SPICE the fil
 
 import hashlib
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation, localcontext
 from functools import lru_cache
@@ -177,17 +177,26 @@ def _read_csv(path: str) -> tuple[Decimal, Float64[np.ndarray, "n 8"]]:
 def _join_times(
     path: str, name: str, times: list[Any], poses: Float64[np.ndarray, "n 7"], exponent: int | None = None
 ) -> tuple[Decimal, Float64[np.ndarray, "n 8"]]:
-    """Return the first time and the table of times since then and poses.
+    """Subtract the first time from all, in decimal numbers; return it and the table of differences (s) and poses.
 
-    - times: text, integers or floating-point numbers in the unit of the column `name`, or 10^exponent s
+    - times: text, integers, decimal or floating-point numbers in the unit of the column `name`, or 10^exponent s
 
-    Raises TrajectoryFileError for times that are rounded too much, ValueError for text that is not a number.
+    A floating-point number is replaced by its shortest decimal, which is the one that its author wrote if that has at
+    most 15 digits. Raises TrajectoryFileError for times that are rounded too much, ValueError for text that is not a
+    number.
     """
     exponent = _EXPONENTS[name] if exponent is None else exponent
     if _is_printed_from_floats(times):
         times = [float(time) for time in times]
-    start, seconds = _subtract_start(times, exponent)
-    values = np.column_stack([seconds, poses])
+    start, seconds = Decimal(0), []
+    for row, time in enumerate(times):
+        try:
+            value = Decimal(repr(time) if isinstance(time, float) else time).scaleb(exponent)
+        except InvalidOperation as error:
+            raise ValueError(f"the time {time!r} is not a number") from error
+        start = start if row else value
+        seconds.append(float(value - start) if value.is_finite() and start.is_finite() else float("nan"))
+    values = np.column_stack([np.array(seconds, dtype=np.float64), poses])
     if all(isinstance(time, float) for time in times):
         _check_resolution(path, name, np.array(times, dtype=np.float64), exponent, values)
     return start, values
@@ -207,27 +216,6 @@ def _is_printed_from_floats(times: Sequence[Any]) -> bool:
             )
     except (InvalidOperation, OverflowError, ValueError):
         return False
-
-
-def _subtract_start(times: Iterable[Any], exponent: int) -> tuple[Decimal, Float64[np.ndarray, "n"]]:
-    """Subtract the first time from all, in decimal numbers; return it and the differences, seconds.
-
-    - times: text, integers, decimal or floating-point numbers
-    - exponent: power of ten of the unit in seconds
-
-    A floating-point number is replaced by its shortest decimal, which is the one that its author wrote if that has at
-    most 15 digits. Raises ValueError for text that is not a number.
-    """
-    start: Decimal | None = None
-    seconds = []
-    for time in times:
-        try:
-            value = Decimal(repr(time) if isinstance(time, float) else time).scaleb(exponent)
-        except InvalidOperation as error:
-            raise ValueError(f"the time {time!r} is not a number") from error
-        start = value if start is None else start
-        seconds.append(float(value - start) if value.is_finite() and start.is_finite() else float("nan"))
-    return start or Decimal(0), np.array(seconds, dtype=np.float64)
 
 
 def _read_parquet(path: str) -> tuple[Decimal, Float64[np.ndarray, "n 8"]]:

@@ -21,23 +21,27 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.driven_ground import DrivenGround
-from marsyard.sim.dynamics.kernels import suspension
 from marsyard.sim.frames import rigid, rotation_matrix
 from marsyard.sim.parameters import Parameters, bounded_field
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 Vector6 = Float64[np.ndarray, "6"]
 WheelPoints = Float64[np.ndarray, "6 3"]
+Point = Float64[np.ndarray, "2"]
+Coordinates = float | NDArray[np.float64]
 
 #: Names of the wheels, in the order of all arrays.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
-#: Signs of the wheels' y coordinates.
+#: Signs of the wheels' y coordinates, and of their rockers' angles.
 _SIDE_SIGNS = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+#: Whether a wheel is on a bogie, and the index of its side's bogie among the joints (differential, left, right bogie).
+_ON_BOGIE, _BOGIES = np.array([False, True, True] * 2), np.array([1, 1, 1, 2, 2, 2])
 #: Sample points of a tread: angles about the axle from straight below, and lateral positions in widths of the tread.
 _TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
 _TREAD_OFFSETS = np.array([-0.5, 0.0, 0.5])
@@ -92,7 +96,7 @@ class RoverParameters(Parameters):
         return np.stack([x, y, np.full(6, self.wheel_radius_m)], axis=1)
 
     @property
-    def pivots_m(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    def pivots_m(self) -> tuple[Point, Point]:
         """(x, z) of the rockers' axis and of the bogies' on level ground, rover frame."""
         rocker = np.array([self.rocker_pivot_x_m, self.rocker_pivot_z_m])
         return rocker, np.array([self.bogie_pivot_x_m, self.bogie_pivot_z_m])
@@ -201,18 +205,35 @@ def compute_wheel_centres(
     rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
 ) -> WheelPoints:
     """Compute the centres of the wheels in the rover frame from the joint angles, metres."""
-    joints = np.array([differential_rad, *bogies_rad])
-    return np.asarray(suspension.compute_wheel_centres(rover.wheel_centres_m, *rover.pivots_m, joints))
+    joints = np.array([[differential_rad, *bogies_rad]])
+    return np.asarray(_rotate_wheels(rover.wheel_centres_m, rover.pivots_m, joints)[0])
 
 
 def compute_bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
     """Compute the positions of the left and the right bogie's pivot, rover frame, metres."""
     rocker_pivot, (x, z) = rover.pivots_m
-    y = rover.half_track_m
-    left, right = (
-        suspension.rotate_about_pivot(x, z, angle, rocker_pivot) for angle in (differential_rad, -differential_rad)
-    )
-    return np.array([[left[0], y, left[1]], [right[0], -y, right[1]]])
+    x, z = _rotate_about_pivot(x, z, np.array([differential_rad, -differential_rad]), rocker_pivot)
+    return np.stack([x, np.array([rover.half_track_m, -rover.half_track_m]), z], axis=1)
+
+
+def _rotate_wheels(
+    level_centres: WheelPoints, pivots: tuple[Point, Point], joints: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 6 3"]:
+    """Rotate the wheels' centres by n sets of angles of the differential, the left and the right bogie."""
+    x, y, z = level_centres.T
+    bogie_x, bogie_z = _rotate_about_pivot(x, z, joints[:, _BOGIES], pivots[1])
+    x, z = np.where(_ON_BOGIE, bogie_x, x), np.where(_ON_BOGIE, bogie_z, z)
+    x, z = _rotate_about_pivot(x, z, _SIDE_SIGNS * joints[:, :1], pivots[0])
+    return np.stack([x, np.broadcast_to(y, x.shape), z], axis=-1)
+
+
+def _rotate_about_pivot(
+    x: Coordinates, z: Coordinates, angles: NDArray[np.float64], pivot: Point
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotate points (x, z) about a pivot (x, z); a positive angle lowers points in front of the pivot."""
+    sine, cosine = np.sin(angles), np.cos(angles)
+    x, z = x - pivot[0], z - pivot[1]
+    return pivot[0] + cosine * x + sine * z, pivot[1] + cosine * z - sine * x
 
 
 @dataclass(frozen=True)
@@ -262,8 +283,8 @@ class _StanceEquations:
         return heights[np.arange(6), lowest], self._tread[lowest]
 
     @cached_property
-    def _geometry(self) -> tuple[WheelPoints, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
-        return (self.rover.wheel_centres_m, *self.rover.pivots_m)
+    def _geometry(self) -> tuple[WheelPoints, tuple[Point, Point]]:
+        return self.rover.wheel_centres_m, self.rover.pivots_m
 
     @cached_property
     def _tread(self) -> Float64[np.ndarray, "points 3"]:
@@ -274,6 +295,16 @@ class _StanceEquations:
     def _compute_heights(
         self, unknowns: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels points 3"]
     ) -> Float64[np.ndarray, "n 6 points"]:
-        """Compute the heights of tread points above the ground; `treads` as in `suspension.compute_tread_points`."""
-        x, y, z = suspension.compute_tread_points(unknowns, self.yaw_rad, self.position_m, *self._geometry, treads)
-        return np.asarray(z - self.ground.height(x, y))
+        """Compute the heights of tread points above the ground, for n sets of unknowns.
+
+        `treads` are points relative to the wheels' centres, for each wheel or once if common to all wheels.
+        """
+        a, b, c = np.moveaxis(_rotate_wheels(*self._geometry, unknowns[:, 3:])[:, :, None] + treads, -1, 0)
+        # rotation by roll about x, then by -pitch about y, then by yaw about z
+        (sp, sr), (cp, cr) = (function(unknowns.T[1:3, :, None, None]) for function in (np.sin, np.cos))
+        sy, cy = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
+        up = sr * b + cr * c
+        forward, left = cp * a - sp * up, cr * b - sr * c
+        x = self.position_m[0] + cy * forward - sy * left
+        y = self.position_m[1] + sy * forward + cy * left
+        return np.asarray(unknowns[:, 0, None, None] + cp * up + sp * a - self.ground.height(x, y))

@@ -71,55 +71,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True)
-class DescentPath:
-    """Solutions of the equations of motion from time 0 backward and forward, with CyRK's dense output."""
-
-    backward: PySolver
-    forward: PySolver
-
-    @classmethod
-    def integrate(
-        cls, state: StateVector, lead_s: float, max_s: float, event: Callable[..., float], constants: Constants
-    ) -> DescentPath:
-        """Integrate from a state at time 0: back by `lead_s`, and forward until `event` is zero or for `max_s`.
-
-        `event` has the attribute `terminal` of SciPy's events. `constants` are from `kernels.pack_constants`. Raises
-        ValueError if the integration fails.
-        """
-        solutions = []
-        for end_s, events in ((-lead_s, None), (max_s, (event,))):
-            solution = pysolve_ivp(
-                kernels.state_derivative,
-                (0.0, end_s),
-                state,
-                method="DOP853",
-                dense_output=True,
-                rtol=TOLERANCE,
-                atol=TOLERANCE,
-                events=events,
-                args=constants,
-            )
-            if not solution.success:
-                raise ValueError(f"the integration of the descent fails at {solution.t[-1]:.6g} s: {solution.message}")
-            solutions.append(solution)
-        return cls(*solutions)
-
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last time."""
-        return float(self.backward.t[-1]), float(self.forward.t[-1])
-
-    def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
-        """Return the state vectors at many times (`kernels.swing`). Raises ValueError for times outside the span."""
-        check_times(times_s, self.span_s)
-        states = np.empty((times_s.size, kernels.SIZE))
-        is_backward = times_s < 0.0
-        for solution, selected in ((self.backward, is_backward), (self.forward, ~is_backward)):
-            states[selected] = solution(times_s[selected]).T
-        return states
-
-
-@dataclass(frozen=True)
 class SwingDescent(Trajectory):
     """Simulated parachute descent of a lander below a swinging line: a `Trajectory` of the camera.
 
@@ -131,7 +82,8 @@ class SwingDescent(Trajectory):
     - parameters, start_m: parameters of the descent, and the camera's position at time 0, world axes, metres
     - wind: mean wind and gusts as functions of height
     - ground_height_m: world z of the ground, the reference of altitudes
-    - chain, path: constants and solution of the equations of motion
+    - chain: constants of the equations of motion
+    - backward, forward: solutions of the equations from time 0, with CyRK's dense output
     """
 
     parameters: SwingParameters
@@ -139,7 +91,8 @@ class SwingDescent(Trajectory):
     wind: Wind
     ground_height_m: float
     chain: Chain
-    path: DescentPath
+    backward: PySolver
+    forward: PySolver
 
     @classmethod
     def simulate(
@@ -181,20 +134,31 @@ class SwingDescent(Trajectory):
         remaining_height.terminal = True  # type: ignore[attr-defined]
         # the fall takes about this height / rate; three times as long ends a flight that does not fall
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
-        path = DescentPath.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
-        return cls(p, start_m, wind, ground_height_m, chain, path)
+        constants = kernels.pack_constants(chain, wind.field)
+        backward = _integrate(state, -lead_s, None, constants)
+        forward = _integrate(state, max_s, (remaining_height,), constants)
+        return cls(p, start_m, wind, ground_height_m, chain, backward, forward)
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last time of the simulation."""
-        return self.path.span_s
+        return float(self.backward.t[-1]), float(self.forward.t[-1])
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Compute the true states at many times. Raises ValueError for times outside the span."""
         positions, velocities, matrices, rates, forces = kernels.compute_truth(
-            self.path.at(times_s), self.chain, self.wind.field
+            self._compute_states(times_s), self.chain, self.wind.field
         )
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
+
+    def _compute_states(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
+        """Compute the state vectors (`kernels.swing`) at many times. Raises ValueError for times outside the span."""
+        check_times(times_s, self.span_s)
+        states = np.empty((times_s.size, kernels.SIZE))
+        is_backward = times_s < 0.0
+        for solution, selected in ((self.backward, is_backward), (self.forward, ~is_backward)):
+            states[selected] = solution(times_s[selected]).T
+        return states
 
     def time_of_altitude(self, altitude_m: float) -> float:
         """Return the time at which the camera passes an altitude above the ground; ValueError if it does not."""
@@ -202,7 +166,7 @@ class SwingDescent(Trajectory):
 
         def height_above(time_s: float) -> float:
             return (
-                _compute_camera_height(self.path.at(np.array([time_s]))[0], self.chain)
+                _compute_camera_height(self._compute_states(np.array([time_s]))[0], self.chain)
                 - self.ground_height_m
                 - altitude_m
             )
@@ -216,6 +180,29 @@ class SwingDescent(Trajectory):
     def thruster_firing_s(self) -> float:
         """Time of the thrusters' firing, at `thruster_firing_m` above the ground."""
         return self.time_of_altitude(self.parameters.thruster_firing_m)
+
+
+def _integrate(
+    state: StateVector, end_s: float, events: tuple[Callable[..., float]] | None, constants: Constants
+) -> PySolver:
+    """Integrate from a state at time 0 to `end_s`, or until an event is zero that has the attribute `terminal`.
+
+    `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
+    """
+    solution = pysolve_ivp(
+        kernels.state_derivative,
+        (0.0, end_s),
+        state,
+        method="DOP853",
+        dense_output=True,
+        rtol=TOLERANCE,
+        atol=TOLERANCE,
+        events=events,
+        args=constants,
+    )
+    if not solution.success:
+        raise ValueError(f"the integration of the descent fails at {solution.t[-1]:.6g} s: {solution.message}")
+    return solution
 
 
 def _compute_camera_height(y: StateVector, chain: Chain) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from marsyard.sim.dynamics.kernels.wind import WindField, compute_wind_profile
+from marsyard.sim.dynamics.kernels.swing import WindField, compute_wind_profile
 from marsyard.sim.error_sources import GUSTS
 from marsyard.sim.parameters import Parameters, Positive, bounded_field
 

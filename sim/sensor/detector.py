@@ -18,7 +18,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
-from marsyard.sim.sensor.companding import Counts, compand, expand
+from marsyard.sim.sensor.image_coding import Counts, compand, expand
 from marsyard.sim.sensor.image_motion import ImageMotion, moving_exposure
 from marsyard.sim.sensor.optics import Image, OpticsParameters, apply_point_spread, dust_transmission
 

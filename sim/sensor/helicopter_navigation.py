@@ -21,16 +21,16 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.sensor.gps import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, STANDARD_GRAVITY_M_S2, ImuParameters
 from marsyard.sim.sensor.kernels import navigation as kernels
-from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
 
@@ -60,30 +60,12 @@ class FilterState:
 
 
 @dataclass(frozen=True)
-class Innovations:
-    """Innovations: measured minus expected readings.
-
-    - kinds: `kernels.POSITION_FIX`, `VELOCITY_FIX`, `COMPASS` or `INCLINOMETER`
-    - axes: component of the reading
-    - normalised: innovation divided by its expected standard deviation
-    - used: whether it passed the gate
-    """
-
-    times_s: Float64[np.ndarray, "n"]
-    kinds: Int64[np.ndarray, "n"]
-    axes: Int64[np.ndarray, "n"]
-    normalised: Float64[np.ndarray, "n"]
-    used: Bool[np.ndarray, "n"]
-
-
-@dataclass(frozen=True)
 class NavigationSolution:
     """Estimates at each sample boundary of the inertial unit; times are the unit's time tags.
 
     - positions_m, velocities_m_s: world axes
     - attitudes: rotations from body to world axes
     - gyro_biases_rad_s, accelerometer_biases_m_s2: estimates, body axes
-    - covariance_indices, covariances: boundaries with stored covariances, and these (15 estimated errors, SI units)
     - end: filter state at the last boundary
     """
 
@@ -93,9 +75,6 @@ class NavigationSolution:
     attitudes: Rotation
     gyro_biases_rad_s: Float64[np.ndarray, "m 3"]
     accelerometer_biases_m_s2: Float64[np.ndarray, "m 3"]
-    covariance_indices: Int64[np.ndarray, "k"]
-    covariances: Float64[np.ndarray, "k 15 15"]
-    innovations: Innovations
     end: FilterState
 
     def pose(self, time_s: float) -> RigidTransform:
@@ -159,32 +138,22 @@ class NavigationFilter:
         return FilterState(state, np.diag(deviations**2), memory)
 
     def run(
-        self,
-        start: FilterState,
-        increments: ImuIncrements,
-        solutions: RtkSolutions,
-        readings: TiltCompassReadings,
-        covariance_times_s: Float64[np.ndarray, "k"] | None = None,
+        self, start: FilterState, increments: ImuIncrements, solutions: RtkSolutions, readings: TiltCompassReadings
     ) -> NavigationSolution:
-        """Run the filter; store covariances at the last boundary before each of `covariance_times_s`."""
-        tags = increments.times_s
-        times = np.zeros(0) if covariance_times_s is None else covariance_times_s
-        indices = np.sort(np.clip(np.searchsorted(tags, times, side="right") - 1, 0, tags.size - 1)).astype(np.int64)
+        """Run the filter over the increments; solutions and readings outside of them are not used."""
         covariance, memory = start.covariance.copy(), start.memory.copy()
         inputs = kernels.Inputs(
-            times=tags,
+            times=increments.times_s,
             step=increments.period_s,
             angles=increments.delta_angles_rad,
             velocities=increments.delta_velocities_m_s,
             gps=self._convert_solutions(solutions),
             compass=self._convert_readings(readings),
-            covariance_indices=indices,
         )
         tuning = self._create_tuning(increments.period_s)
-        states, covariances, log = kernels.run(inputs, start.state, covariance, memory, tuning)
+        states = kernels.run(inputs, start.state, covariance, memory, tuning)
         blocks = [kernels.VELOCITY, kernels.QUATERNION, kernels.STATE_GYRO_BIAS, kernels.STATE_ACCELEROMETER_BIAS]
         positions, velocities, quaternions, gyro_biases, accelerometer_biases = np.split(states, blocks, axis=1)
-        kinds, axes = (log[:, column].astype(np.int64) for column in (kernels.LOG_TYPE, kernels.LOG_AXIS))
         return NavigationSolution(
             increments=increments,
             positions_m=positions,
@@ -192,11 +161,6 @@ class NavigationFilter:
             attitudes=Rotation.from_quat(quaternions),
             gyro_biases_rad_s=gyro_biases,
             accelerometer_biases_m_s2=accelerometer_biases,
-            covariance_indices=indices,
-            covariances=covariances,
-            innovations=Innovations(
-                log[:, kernels.LOG_TIME], kinds, axes, log[:, kernels.LOG_NORMALISED], log[:, kernels.LOG_USED] == 1.0
-            ),
             end=FilterState(states[-1].copy(), covariance, memory),
         )
 

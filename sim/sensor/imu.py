@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.error_sources import ACCELERATION, ATTITUDE
+from marsyard.sim.frames import multiply_quaternions
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.quaternions import multiply_quaternions
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times, Vector, Vectors
 
 STANDARD_GRAVITY_M_S2 = 9.80665  #: Standard gravity, the unit of accelerometer specifications.

@@ -215,3 +215,8 @@ def valid_velocity(estimate: VelocityEstimate) -> np.ndarray:
     """Return the velocity of an estimate. Fails without a velocity."""
     assert estimate.velocity_m_s is not None
     return estimate.velocity_m_s
+
+
+def draw_stripes(counts: np.ndarray) -> np.ndarray:
+    """Return counts of 0 in even and of 4095 in odd columns."""
+    return np.broadcast_to(4095 * (np.arange(counts.shape[1]) % 2), counts.shape).astype(np.uint16)

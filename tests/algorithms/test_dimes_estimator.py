@@ -18,6 +18,7 @@ from tests.algorithms.synthetic_descent import (
     Flight,
     compute_body_rays,
     draw_flight,
+    draw_stripes,
     draw_terrain,
     expose_scene,
     make_calibration,
@@ -56,45 +57,20 @@ def compute_rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
-def test_noise_free_velocity_error_is_within_requirement() -> None:
+@pytest.mark.parametrize(
+    ("seed", "count", "is_noisy", "max_rms_m_s"),
+    [(2024, 12, False, 0.05), pytest.param(2025, 6, True, 0.06, marks=pytest.mark.slow)],
+)
+def test_velocity_error_is_within_the_requirement(seed: int, count: int, is_noisy: bool, max_rms_m_s: float) -> None:
     # The requirement is 0.15 m/s rms over flat terrain. Aliasing in the binned pixels causes 0.02 m/s (0.015 px).
-    rng = np.random.default_rng(2024)
-    flights = [draw_flight(rng) for _ in range(12)]
-    estimates = [ESTIMATOR.estimate(render(flight)) for flight in flights]
-    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
-    errors = np.array(
-        [estimate.velocity_m_s - flight.velocities[1, :2] for estimate, flight in zip(estimates, flights, strict=True)]
-    )
-    assert compute_rms(errors) < 0.05
+    rng = np.random.default_rng(seed)
+    flights = [draw_flight(rng) for _ in range(count)]
+    estimates = [ESTIMATOR.estimate(render(flight, noise=rng if is_noisy else None)) for flight in flights]
+    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * count
+    errors = [valid_velocity(e) - flight.velocities[1, :2] for e, flight in zip(estimates, flights, strict=True)]
+    assert compute_rms(np.array(errors)) < max_rms_m_s
     # at least 90 % of the tracks, two templates in each of two pairs, are valid
-    assert len(track_errors(flights, estimates)) >= 0.9 * 4 * len(flights)
-
-
-def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
-    rng = np.random.default_rng(2024)
-    flights = [draw_flight(rng) for _ in range(6)]
-    estimates = [DimesEstimator().estimate(render(flight)) for flight in flights]
-    # The fit is biased by up to 0.12 px of 5.6 m in 3.75 s (0.18 m/s) on each axis.
-    assert 0.03 < compute_rms(track_errors(flights, estimates)) < 0.18
-
-
-@pytest.mark.slow
-def test_velocity_is_accurate_with_flight_camera_noise() -> None:
-    rng = np.random.default_rng(2025)
-    flights = [draw_flight(rng) for _ in range(6)]
-    estimates = [ESTIMATOR.estimate(render(flight, noise=rng)) for flight in flights]
-    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
-    errors = np.array(
-        [valid_velocity(e) - flight.velocities[1, :2] for e, flight in zip(estimates, flights, strict=True)]
-    )
-    assert compute_rms(np.array(errors)) < 0.06
-
-
-@pytest.mark.parametrize("velocity", [(20.0, 0.0), (0.0, 20.0), (-15.0, 25.0)])
-def test_east_and_north_velocities_are_not_swapped(velocity: tuple[float, float]) -> None:
-    attitudes = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
-    answer = ESTIMATOR.estimate(render(steady_flight(velocity, attitudes)))
-    np.testing.assert_allclose(valid_velocity(answer), velocity, atol=0.1)
+    assert len(track_errors(flights, estimates)) >= 0.9 * 4 * count
 
 
 def test_template_and_match_show_the_same_ground() -> None:
@@ -222,11 +198,6 @@ def _draw_random_counts(number: int, counts: np.ndarray) -> np.ndarray:
     return np.random.default_rng(number).integers(0, 4096, counts.shape, dtype=np.uint16)
 
 
-def _draw_stripes(_: int, counts: np.ndarray) -> np.ndarray:
-    """Set even columns to 0 and odd columns to 4095."""
-    return np.where(np.arange(counts.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(counts)
-
-
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
     return render(steady_flight((10.0, 5.0)))
@@ -240,7 +211,7 @@ def measurements() -> DescentMeasurements:
         lambda number, counts: np.full_like(counts, 65535),
         _draw_random_counts,
         lambda number, counts: counts if number else np.zeros_like(counts),
-        _draw_stripes,
+        lambda number, counts: draw_stripes(counts),
         lambda number, counts: np.full_like(counts, number),
     ],
 )
@@ -380,16 +351,6 @@ def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurement
             pixels = products[f"rectified_{track.pair}_{side}"]
             result = [ndimage.map_coordinates(pixels[..., k], [[row], [column]], order=3)[0] for k in (0, 1)]
             np.testing.assert_allclose(result, pixel, atol=0.1)
-
-
-def test_inputs_are_unchanged_and_estimates_are_deterministic(measurements: DescentMeasurements) -> None:
-    copies = [image.counts.copy() for image in measurements.images]
-    first, second = (dimes_products(get_details(ESTIMATOR.estimate(measurements))) for _ in range(2))
-    for image, copy in zip(measurements.images, copies, strict=True):
-        np.testing.assert_array_equal(image.counts, copy)
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        np.testing.assert_array_equal(value, second[key])
 
 
 def test_altitude_error_causes_predicted_velocity_error() -> None:

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.dimes import ground_view, overlap, rectification
+from marsyard.algorithms.dimes.ground_view import zero_phase_pixel
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView, build_view
-from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
@@ -95,13 +95,6 @@ def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
     # 30 m/s in 3.75 s: 112.5 m (the paper's "at least 110 m") are 20.003 px, rounded up to 21, plus the margin.
     assert geometry.search_px == 21 + OPTIONS.search_margin_px
     assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
-
-
-def test_lattice_and_outline_have_the_expected_number_of_points() -> None:
-    assert ground_view.square_lattice(3.0, 4).shape == (16, 2)
-    outline = ground_view.square_outline(3.0, 4)
-    assert outline.shape == (12, 2)
-    assert np.all(np.abs(outline).max(axis=1) == 3.0)
 
 
 def test_nadir_overlap_is_the_smaller_image() -> None:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import bin_factors, bin_mean
 from marsyard.algorithms.dimes.rectification import correct_patch
-from marsyard.algorithms.dimes.views import BinnedView, build_view
+from marsyard.algorithms.dimes.views import BinnedView, bin_factors, bin_mean, build_view
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (

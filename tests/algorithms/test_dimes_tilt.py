@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes.ground_tracks import GroundTracks
-from marsyard.algorithms.dimes.tilt import expected_attitude_error, fit_ground, levelled_velocity
+from marsyard.algorithms.dimes.tilt import GroundTracks, expected_attitude_error, fit_ground, levelled_velocity
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (

@@ -80,7 +80,10 @@ def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path
     for reference, actual in zip(measurements.attitudes, restored_case.attitudes, strict=True):
         # normalising the quaternion again changes the last digits
         assert (reference.world_from_body.inv() * actual.world_from_body).magnitude() < 1e-14
-    assert len(list(tmp_path.glob("*.f64"))) == 1  # one flat field for three images of one camera
+    # one flat field for three images of one camera
+    cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.{image_format}" for k in (1, 2, 3)]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
 
 
 def test_landing_without_range_round_trips(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -226,23 +229,22 @@ def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurem
     end_idle_programs()
 
 
-#: A program that answers each case twice: `PAUSE_S` after the request, and again after the same time.
+#: A program that answers each case twice: 0.05 s after the request, and again after the same time.
 DOUBLE_ANSWERS = """
 print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 for number, line in enumerate(sys.stdin):
     request = json.loads(line)
-    time.sleep(PAUSE_S)
+    time.sleep(0.05)
     answer = {"exchange": 3, "id": request["id"], "outcome": "VALID", "velocity_m_s": [number, 0]}
     print(json.dumps(answer), flush=True)
-    time.sleep(PAUSE_S)
+    time.sleep(0.05)
     print(json.dumps(answer), flush=True)
 """
 
 
 def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '0.05'))}"
-    first = run_program(spec, measurements).velocity_m_s
-    assert first is not None
+    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS)}"
+    run_program(spec, measurements)
     time.sleep(0.5)  # the second line is in the pipe
     with pytest.raises(AlgorithmError, match="before the request; expected one line") as error:
         run_program(spec, measurements)
@@ -251,16 +253,6 @@ def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements,
     velocity = run_program(spec, measurements).velocity_m_s
     assert velocity is not None
     assert velocity[0] == 0.0
-    end_idle_programs()
-
-
-def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    # The second line follows the next request: only its id shows that it answers the previous request.
-    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '1.0'))}"
-    run_program(spec, measurements)
-    with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as error:
-        run_program(spec, measurements)
-    assert error.value.fault is Fault.BAD_ANSWER
     end_idle_programs()
 
 
@@ -335,7 +327,6 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
     subprocess.run([compiler, "-O2", "-std=c11", *warnings, "-o", str(executable), source, "-lm"], check=True)
     for spec in (f"exec:{executable}", f"serve:{executable} --serve"):
         result = run_program(spec, measurements)
-        assert result.velocity_m_s is not None
         # Matches are whole pixels of 1.6 m (4 summed rows: 6.5 m) over 3.75 s. The median of 25 matches has a quarter
         # of the error of one match.
         assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
@@ -354,9 +345,7 @@ def test_python_example_estimates_velocity(measurements: DescentMeasurements, mo
     monkeypatch.chdir(EXAMPLES)
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())
     result = check_velocity(estimator.estimate(measurements))
-    assert result.velocity_m_s is not None
     assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
-    assert result.covariance_m2_s2 is not None
 
 
 def test_program_that_does_not_read_a_long_request_times_out() -> None:

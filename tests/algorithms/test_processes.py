@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from marsyard.algorithms.awake_clock import AwakeClock
+from marsyard.algorithms.exchange.process import AwakeClock
 from marsyard.algorithms.processes import processor_time_s
 
 

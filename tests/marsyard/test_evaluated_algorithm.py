@@ -72,7 +72,7 @@ def test_record_describes_the_algorithms(folder: Path) -> None:
     assert (tested_entry["version"], tested_entry["options"]) == ("3.1", {"gain": 0.5})
     assert re.fullmatch("[0-9a-f]{16}", tested_entry["source_hash"])
     assert compared_entry["spec"] == "homography"
-    assert compared_entry["path"] == "marsyard.algorithms.dimes.homography:HomographyEstimator"
+    assert compared_entry["path"] == "marsyard.algorithms.dimes.baselines:HomographyEstimator"
     assert compared_entry["version"]
     assert compared_entry["options"]
 

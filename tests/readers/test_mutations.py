@@ -37,13 +37,13 @@ from marsyard.campaigns.store.products import load_products, pack_products, save
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 from marsyard.reports.stored import read_run
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.image_files import read_counts, read_elevation, read_flat_field
 from marsyard.scenarios.measured.image_table import read_table
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
 from marsyard.scenarios.measured.layout import IngestError, read_ingest_file
 from marsyard.scenarios.mesh_files import MeshFileError, read_mesh
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.scenarios.velocity import VELOCITY_FORMAT
 from marsyard.sim.camera import CameraFileError, read_cameras
@@ -56,7 +56,7 @@ from tests.scenarios.test_terrain_files import write_tif
 from tests.sim.camera.test_calibrations import KALIBR, OPENCV
 from tests.sim.camera.test_files import CMOD_TEXT, LABEL
 from tests.sim.camera.test_pds4 import LABEL as PDS4_LABEL
-from tests.sim.sensor.test_datasheet import DATASHEET
+from tests.sim.sensor.test_datasheets import DATASHEET
 
 ROWS: list[dict[str, Any]] = [
     {"case": case, "outcome": "VALID", "answered": True, "velocity_error_m_s": 0.1 * case, "site": "gusev",
@@ -192,12 +192,8 @@ def _text(text: str) -> Callable[[Path], object]:
 
 READERS: Mapping[str, Reader] = {
     **{
-        f"terrain {name}": Reader(name, write, read, TerrainFileError)
-        for name, write in (("dtm.tif", _write_relief), ("dtm.npz", _write_npz))
-        for read in (_read_terrain,)
-    },
-    **{
-        f"rasters {name}": Reader(name, write, _read_rasters, TerrainFileError)
+        f"{kind} {name}": Reader(name, write, read, TerrainFileError)
+        for kind, read in (("terrain", _read_terrain), ("rasters", _read_rasters))
         for name, write in (("dtm.tif", _write_relief), ("dtm.npz", _write_npz))
     },
     **{

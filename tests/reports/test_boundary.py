@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 from scipy.special import expit
 
-from marsyard.reports.boundary import boundary_section
-from marsyard.reports.boundary_fit import fit_probability, validate_fit
+from marsyard.reports.influences import boundary_section, fit_probability, validate_fit
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from marsyard.reports.explorer import MAX_POINTS, ExploredRequirement, choose_points, explorer_data
 from marsyard.reports.gallery import gallery_candidates, gallery_cases
-from marsyard.reports.page_scripts import embed_json
+from marsyard.reports.page_environment import embed_json
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import make_rows
 

@@ -28,41 +28,32 @@ def create_study(limit: float, violations: int, cases: int, terrains: int = 0, p
     return {"study": json.loads(json.dumps(study))}
 
 
-def test_pass_states_the_counting_bound() -> None:
-    sentences = rare_sentences(create_study(1e-2, 0, 1000))
-    assert sentences[0] == "VEL: PASS, by counting independent cases."
-    # 1 - 0.05^(1/1000) = 0.0030
-    assert sentences[1] == (
-        "Probability of a violation per case by counting: at most 0.003 (95 % confidence), from 0 violations in 1,000 "
-        "independent random cases. The limit is 0.01."
-    )
-    assert not any("marsyard append" in sentence for sentence in sentences)
-
-
-def test_estimate_below_the_limit_states_the_random_cases_that_decide() -> None:
-    text = " ".join(rare_sentences(create_study(1e-3, 0, 1000)))
-    assert "VEL: INSUFFICIENT." in text
-    assert "Subset simulation estimates 0.0001" in text
-    assert "no PASS rests on it" in text
-    # ln(0.025) / ln(0.999) = 3,687.04 cases at half of the risk, without the 1,000 finished ones
-    assert "PASS needs 2,688 additional random cases without a violation: marsyard append DIR 2688 --random." in text
-
-
-def test_estimate_above_the_limit_states_the_replicates_that_decide() -> None:
-    text = " ".join(rare_sentences(create_study(8e-5, 0, 1000)))
-    assert "would decide the verdict if the estimate remains: marsyard append DIR" in text
-    assert "--random" not in text
-
-
-def test_fail_states_its_assumption() -> None:
-    sentences = rare_sentences(create_study(1e-5, 0, 1000))
-    assert sentences[0] == "VEL: FAIL, by the interval of the simulations; it assumes a continuous margin."
-
-
-def test_shared_terrains_are_stated() -> None:
-    text = " ".join(rare_sentences(create_study(1e-2, 0, 1000, terrains=50)))
-    assert "1,000 independent random cases on 50 terrains, which are counted instead of cases" in text
-    assert "each on a new terrain" in text
+@pytest.mark.parametrize(
+    ("limit", "terrains", "beginning", "messages"),
+    [
+        # 1 - 0.05^(1/1000) = 0.0030
+        (1e-2, 0, "VEL: PASS, by counting independent cases.",
+         ["Probability of a violation per case by counting: at most 0.003 (95 % confidence), from 0 violations in "
+          "1,000 independent random cases. The limit is 0.01."]),
+        # ln(0.025) / ln(0.999) = 3,687.04 cases at half of the risk, without the 1,000 finished ones
+        (1e-3, 0, "VEL: INSUFFICIENT.",
+         ["Subset simulation estimates 0.0001", "no PASS rests on it", "PASS needs 2,688 additional random cases "
+          "without a violation: marsyard append DIR 2688 --random."]),
+        (8e-5, 0, "VEL: ", ["would decide the verdict if the estimate remains: marsyard append DIR"]),
+        (1e-5, 0, "VEL: FAIL, by the interval of the simulations; it assumes a continuous margin.", []),
+        (1e-2, 50, "VEL: ", ["1,000 independent random cases on 50 terrains, which are counted instead of cases",
+                             "each on a new terrain"]),
+    ],
+)  # fmt: skip
+def test_sentences_state_verdict_bound_and_remedy(
+    limit: float, terrains: int, beginning: str, messages: list[str]
+) -> None:
+    text = " ".join(rare_sentences(create_study(limit, 0, 1000, terrains)))
+    assert text.startswith(beginning)
+    for message in messages:
+        assert message in text
+    assert ("marsyard append" in text) == (len(messages) > 1 or limit == 8e-5)
+    assert ("--random" in text) == (len(messages) > 1)
 
 
 @pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import MetricChange, NightComparison, find_changes
-from marsyard.reports.night_page import format_night_page
-from marsyard.reports.statistics.changes import Metric, Sample
+from marsyard.reports.nightly import (
+    FINISHED,
+    INTERRUPTED,
+    RUNNING,
+    History,
+    MetricChange,
+    NightCampaign,
+    NightComparison,
+    find_changes,
+    format_night_page,
+    list_comparisons,
+)
+from marsyard.reports.statistics.difference_tests import Metric, Sample
 
 N_CASES, N_TERRAINS = 100, 12
 

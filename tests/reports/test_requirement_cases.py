@@ -21,8 +21,8 @@ from marsyard.reports.gallery import gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation
+from marsyard.reports.products import thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
-from marsyard.reports.thumbnails import thumbnail
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
 from tests.reports.hda import synthetic_landing

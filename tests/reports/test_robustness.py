@@ -23,11 +23,9 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dispersion_changes import ChangeKind, list_changes
 from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, evaluate_robustness
-from marsyard.reports.robustness_sentences import reach_text, robustness_text
+from marsyard.reports.robustness_section import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.statistics.crossing import Crossing, find_crossing
-from marsyard.reports.statistics.divergence import binary_divergence, population_divergence
-from marsyard.reports.statistics.weighted import weighted_rates
+from marsyard.reports.statistics.reweighted_rates import Crossing, find_crossing, population_divergence, weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import number
@@ -143,7 +141,6 @@ def test_changes_have_the_units_of_the_parameters(tmp_path: Path) -> None:
     assert math.isnan(other.change)
 
 
-#: A campaign with dispersions of one parameter, without cases.
 def test_probability_of_a_value(tmp_path: Path) -> None:
     """A fifth of the rough cases fail, and no other: the rate is 5 % if 25 % are rough (10 % assumed)."""
     rng = np.random.default_rng(1)
@@ -187,15 +184,15 @@ def test_divergence_of_all_dispersions() -> None:
 
     weight = optimize.brentq(excess, 1.0, 50.0)
     worst = weight * rate / (weight * rate + 1.0 - rate)
-    assert binary_divergence(worst, rate) == pytest.approx(radius, rel=1e-6)
+    assert population_divergence(worst, rate, 1.0) == pytest.approx(radius, rel=1e-6)
     rng = np.random.default_rng(2)
     for _ in range(200):  # no other distribution within the ball has a larger rate
         q = p * np.exp(rng.normal(0.0, 0.5, cells))
         q /= q.sum()
         if float(np.sum(q * np.log(q / p))) <= radius:
             assert q[:4].sum() <= worst
-    assert binary_divergence(0.01, 0.02) == 0.0
-    assert binary_divergence(0.01, 0.0) == math.inf
+    assert population_divergence(0.01, 0.02, 1.0) == 0.0
+    assert population_divergence(0.01, 0.0, 1.0) == math.inf
 
 
 def test_divergence_of_a_population_is_smaller_than_that_of_all_cases() -> None:
@@ -209,8 +206,7 @@ def test_divergence_of_a_population_is_smaller_than_that_of_all_cases() -> None:
     tilt = np.linspace(0.0, 5.0, 5001)
     smallest = float((-np.log(np.exp(tilt[:, None] * scores) @ probabilities)).max())
     assert population_divergence(permitted, rate, member) == pytest.approx(smallest, rel=1e-5)
-    assert population_divergence(permitted, rate, member) < 0.51 * binary_divergence(permitted, rate)
-    assert population_divergence(permitted, rate, 1.0) == binary_divergence(permitted, rate)
+    assert population_divergence(permitted, rate, member) < 0.51 * population_divergence(permitted, rate, 1.0)
 
 
 def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None:
@@ -220,14 +216,14 @@ def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None
     verdicts, records, _ = evaluate(tmp_path, 900, 0.95, fails, population="valid", answered=answered)
     item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].n == 300
-    assert 0.0 < item.passes_at < 0.34 * binary_divergence(0.05, 1.0 - verdicts[0].lower)
+    assert 0.0 < item.passes_at < 0.34 * population_divergence(0.05, 1.0 - verdicts[0].lower, 1.0)
 
 
 def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> None:
     verdicts, records, _ = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
     item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].status is Status.PASS
-    assert item.passes_at == pytest.approx(binary_divergence(0.05, 1.0 - verdicts[0].lower))
+    assert item.passes_at == pytest.approx(population_divergence(0.05, 1.0 - verdicts[0].lower, 1.0))
     # a shift of one normal dispersion by d has the divergence d^2 / 2: PASS then holds for any direction
     assert item.lower <= records["loads.0", ChangeKind.MEAN_UP].lower
 
@@ -318,6 +314,8 @@ def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
     nearest = wider if wider.change < up.change else up
     assert f"by chance on average): {nearest.fail_text}" in text
     assert " assumed; PASS up to " in nearest.fail_text
+    # ten changes of three dispersions at 90 %: one of them can show FAIL by chance
+    assert "(of 10 examined, of which at most 1 appear by chance on average)" in text
 
 
 def test_withheld_pass_is_not_stated(tmp_path: Path) -> None:
@@ -366,12 +364,6 @@ def test_too_few_terrains_for_any_change_are_stated(tmp_path: Path) -> None:
     refused = [item for item in records if item is not ball] + [replace(ball, lower=math.nan)]
     text = robustness_text(verdicts[0], refused)
     assert text.startswith("The cases are too few to state how far PASS reaches (effective number: 20).")
-
-
-def test_chance_is_stated(tmp_path: Path) -> None:
-    """Ten changes of three dispersions at 90 %: one of them can show FAIL by chance."""
-    verdicts, _, records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
-    assert "(of 10 examined, of which at most 1 appear by chance on average)" in robustness_text(verdicts[0], records)
 
 
 @pytest.mark.slow

@@ -81,12 +81,6 @@ def test_rate_decides_for_designs_without_independent_draws(definition: dict[str
     assert not combine_verdicts(empty_population, frame, design).sentence.startswith("0 of")
 
 
-def test_design_without_requirements_has_no_verdict() -> None:
-    frame = make_rows(5)
-    assert combine_verdicts([], frame, SamplingDesign("sobol")).status is None
-    assert compute_exit_code([], crashed=False) == 0
-
-
 def test_nominal_case_is_excluded_from_verdicts() -> None:
     frame = make_rows(231)
     frame["velocity_error_m_s"] = 1.0

@@ -10,13 +10,10 @@ import pytest
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
-from marsyard.reports.conditions import bin_conditions, conditions_section
-from marsyard.reports.dimes.ignition_section import ignition_section
-from marsyard.reports.dimes.landing_section import landing_section
-from marsyard.reports.dimes.sensitivity_section import estimate_effects, sensitivity_section
+from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
+from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.terrain_variance import terrain_variance
 from tests.reports.synthetic_run import MakeRun, make_rows
 
 METRIC = "velocity_error_m_s"

@@ -8,9 +8,8 @@ from xml.etree import ElementTree as Xml
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.junit import junit_xml
 from marsyard.reports.overall import combine_verdicts
-from marsyard.reports.traceability import COLUMNS, requirement_evidence, verification_csv
+from marsyard.reports.verdict_files import COLUMNS, junit_xml, requirement_evidence, verification_csv
 from tests.reports.synthetic_run import VELOCITY, make_rows
 
 #: Text that a spreadsheet would evaluate and XML cannot contain.

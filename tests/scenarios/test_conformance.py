@@ -10,7 +10,7 @@ from marsyard.campaigns.running.conformance import run_conformance_checks
 from marsyard.scenarios.conformance import inputs, trackers
 from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, determine_task
 from marsyard.scenarios.conformance.inputs import TexturedPlane
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.camera import Cahv

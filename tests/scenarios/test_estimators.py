@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.dimes.homography import HomographyEstimator
+from marsyard.algorithms.dimes.baselines import HomographyEstimator
 from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, ExecutableTargetTracker
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
@@ -25,7 +25,7 @@ from marsyard.scenarios.algorithm_selection import AlgorithmSelection, check_alg
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.tasks import Task
@@ -54,7 +54,7 @@ def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.
 def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pytest.MonkeyPatch) -> None:
     group = custom_algorithms.GROUP
     entry_points = [
-        EntryPoint(name, "marsyard.algorithms.dimes.homography:HomographyEstimator", group)
+        EntryPoint(name, "marsyard.algorithms.dimes.baselines:HomographyEstimator", group)
         for name in ("installed", "dimes")
     ]
     installed_entry_points = {entry_point.name: entry_point for entry_point in entry_points}

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.image_table import read_table
 from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.mesh_files import MAX_BYTES, MeshFileError, read_mesh
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.scenarios.velocity import VELOCITY_FORMAT
 from marsyard.sim.camera import read_cameras

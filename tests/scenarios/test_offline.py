@@ -11,11 +11,11 @@ from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.algorithm_labels import labels
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.custom_algorithms import algorithm_sources
 from marsyard.scenarios.input_copies import hash_inputs
-from marsyard.scenarios.landing_site import LANDING, SITE_FORMAT
+from marsyard.scenarios.landing_task import LANDING, SITE_FORMAT
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.velocity import VELOCITY, VELOCITY_FORMAT
 

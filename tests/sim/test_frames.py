@@ -1,11 +1,19 @@
-"""Tests of reference frames (world: east, north, up; site: north, east, down) and of rigid transforms."""
+"""Tests of reference frames (world: east, north, up; site: north, east, down), transforms and quaternions."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.frames import SITE_FROM_WORLD, compose, direction, rigid, rigid_from_axes
+from marsyard.sim.frames import (
+    SITE_FROM_WORLD,
+    accumulate_quaternions,
+    compose,
+    direction,
+    multiply_quaternions,
+    rigid,
+    rigid_from_axes,
+)
 
 
 @pytest.mark.parametrize(
@@ -39,3 +47,20 @@ def test_unchecked_transforms_match_scipy() -> None:
         assert_allclose(
             composition.as_matrix(), (transform * rigid(rotations[0], positions[0])).as_matrix(), rtol=0.0, atol=4e-15
         )
+
+
+def test_quaternion_products_match_rotations() -> None:
+    left, right = Rotation.random(50, rng=1), Rotation.random(50, rng=2)
+    product = Rotation.from_quat(multiply_quaternions(left.as_quat(), right.as_quat()))
+    assert_allclose(product.as_matrix(), (left * right).as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
+def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
+    steps = Rotation.random(count, rng=count)
+    product, expected = Rotation.identity(), []
+    for step in steps:
+        product = product * step
+        expected.append(product.as_matrix())
+    result = Rotation.from_quat(accumulate_quaternions(steps.as_quat()))
+    assert_allclose(result.as_matrix(), expected, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Kernels of hazard detection: elevation map of points (section II.D) and least-median-of-squares planes (III).
+"""Kernels of hazard detection: least-median-of-squares planes of footprints (section III).
 
 Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
@@ -14,27 +14,6 @@ Array = NDArray[np.float64]
 #: Inlier limit in standard deviations, and ratio of standard deviation to median absolute value (normal distribution).
 INLIER_DEVIATIONS = 2.5
 SIGMA_PER_MEDIAN = 1.4826
-
-
-@njit(cache=True)
-def accumulate_bilinear(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Distribute values at fractional cells to the four nearest cells with bilinear weights (section II.D).
-
-    Returns the sums of weighted values and of weights per cell.
-    """
-    sums = np.zeros(shape)
-    weights = np.zeros(shape)
-    for k in range(values.size):
-        row, column = math.floor(rows[k]), math.floor(columns[k])
-        row_offset, column_offset = rows[k] - row, columns[k] - column
-        for i in range(2):
-            for j in range(2):
-                r, c = int(row) + i, int(column) + j
-                if 0 <= r < shape[0] and 0 <= c < shape[1]:
-                    weight = (row_offset if i else 1.0 - row_offset) * (column_offset if j else 1.0 - column_offset)
-                    sums[r, c] += weight * values[k]
-                    weights[r, c] += weight
-    return sums, weights
 
 
 @njit(cache=True)

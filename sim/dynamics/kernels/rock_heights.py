@@ -1,4 +1,4 @@
-"""Kernel that rasterizes rocks to a grid of maximum heights."""
+"""Compiled rasterisation of rocks to a grid of maximum heights."""
 
 import math
 

@@ -1,4 +1,6 @@
-"""Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` defines equations and symbols.
+"""Compiled equations of motion of the two-stage pendulum, and the wind that acts on it as a function of height.
+
+`marsyard.sim.dynamics.swing` defines equations and symbols, `marsyard.sim.dynamics.wind` the wind's model.
 
 A state vector has 22 components: position and velocity of the canopy, unit vector along the line (downwards) and its
 time derivative, direction of the lander's axis and its time derivative, and the lander's x axis (three components each,
@@ -11,11 +13,54 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numba.np.unsafe.ndarray import to_fixed_tuple
+from numpy.typing import NDArray
 
-from marsyard.sim.dynamics.kernels.wind import Array, WindField, compute_wind
-
+Array = NDArray[np.float64]
 #: Index of the first component of each vector in a state, and the size of a state.
 CANOPY, CANOPY_VELOCITY, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
+
+
+class WindField(NamedTuple):
+    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.wind.Wind`.
+
+    Columns of `waves`: wavenumber, rad/m; amplitudes east, north and up of the cosine; then of the sine, m/s.
+    """
+
+    ground_height_m: float
+    mean_east_m_s: float
+    mean_north_m_s: float
+    layer_m: float
+    roughness_m: float
+    waves: Array
+
+
+@njit(cache=True)
+def compute_wind(height: float, field: WindField) -> tuple[float, float, float]:
+    """Compute the east, north and upward wind at a world z, m/s."""
+    altitude = max(height - field.ground_height_m, 0.0)
+    profile = 1.0
+    if altitude < field.layer_m:
+        profile = math.log1p(altitude / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
+    east = profile * field.mean_east_m_s
+    north = profile * field.mean_north_m_s
+    up = 0.0
+    for k in range(field.waves.shape[0]):
+        wave = field.waves[k]
+        cosine = math.cos(wave[0] * height)
+        sine = math.sin(wave[0] * height)
+        east += wave[1] * cosine + wave[4] * sine
+        north += wave[2] * cosine + wave[5] * sine
+        up += wave[3] * cosine + wave[6] * sine
+    return east, north, up
+
+
+@njit(cache=True)
+def compute_wind_profile(heights: Array, field: WindField) -> Array:
+    """Compute the wind at many heights, a row (east, north, up) each."""
+    rows = np.empty((heights.size, 3))
+    for i in range(heights.size):
+        rows[i] = compute_wind(heights[i], field)
+    return rows
 
 
 class Chain(NamedTuple):

@@ -19,12 +19,14 @@ from marsyard.sim.dynamics.rotorcraft.flight import (
     TAIL_S,
     Air,
     AltimeterErrors,
-    GroundPatch,
     Phase,
     RotorcraftFlight,
+    SimulatedPath,
+    Vibration,
     simulate_landing,
     simulate_transit,
 )
+from marsyard.sim.dynamics.rotorcraft.kernels import GroundPatch
 from marsyard.sim.dynamics.rotorcraft.parameters import (
     AirParameters,
     LandingGuidance,
@@ -32,7 +34,6 @@ from marsyard.sim.dynamics.rotorcraft.parameters import (
     TransitParameters,
     VibrationParameters,
 )
-from marsyard.sim.dynamics.rotorcraft.path import SimulatedPath, Vibration
 
 __all__ = [
     "TAIL_S", "Air", "AirParameters", "AltimeterErrors", "GroundPatch", "LandingGuidance", "Phase", "RotorcraftFlight",

@@ -98,32 +98,35 @@ class Flight(NamedTuple):
     step: float
 
 
-class Ground(NamedTuple):
-    """Heights on a grid, bilinear within it, constant beyond its edges; row i is at north_m + i * spacing_m."""
+class GroundPatch(NamedTuple):
+    """Heights of the ground around a site on a grid, bilinear within it and constant beyond its edges, metres.
+
+    Row i is at north_m + i * spacing_m, column j at east_m + j * spacing_m.
+    """
 
     east_m: float
     north_m: float
     spacing_m: float
-    heights: Array
+    heights_m: Array
 
 
 @njit(cache=True)
-def compute_ground_height(ground: Ground, east: float, north: float) -> float:
+def compute_ground_height(ground: GroundPatch, east: float, north: float) -> float:
     """Interpolate the height of the ground at a position."""
-    rows, columns = ground.heights.shape
+    rows, columns = ground.heights_m.shape
     y = min(max((north - ground.north_m) / ground.spacing_m, 0.0), rows - 1.0)
     x = min(max((east - ground.east_m) / ground.spacing_m, 0.0), columns - 1.0)
     i = min(int(y), rows - 2)
     j = min(int(x), columns - 2)
     fy = y - i
     fx = x - j
-    south_edge = (1.0 - fx) * ground.heights[i, j] + fx * ground.heights[i, j + 1]
-    north_edge = (1.0 - fx) * ground.heights[i + 1, j] + fx * ground.heights[i + 1, j + 1]
+    south_edge = (1.0 - fx) * ground.heights_m[i, j] + fx * ground.heights_m[i, j + 1]
+    north_edge = (1.0 - fx) * ground.heights_m[i + 1, j] + fx * ground.heights_m[i + 1, j + 1]
     return float((1.0 - fy) * south_edge + fy * north_edge)
 
 
 @njit(cache=True)
-def compute_laser_range(ground: Ground, row: Array) -> float:
+def compute_laser_range(ground: GroundPatch, row: Array) -> float:
     """Compute the range along body -z to the ground; the beam is nearly vertical: four fixed-point steps converge."""
     yaw, pitch, roll = row[ANGLE], row[ANGLE + 1], row[ANGLE + 2]
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
@@ -258,7 +261,7 @@ def land(
     start: int,
     errors: Array,
     laser_noise: Array,
-    ground: Ground,
+    ground: GroundPatch,
     landing: Landing,
     craft: Craft,
 ) -> None:

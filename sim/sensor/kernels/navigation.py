@@ -27,14 +27,9 @@ TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 
 #: First columns in a row of the tilt compass after the time tag: up direction (body axes), and yaw from the heading,
 #: counterclockwise from east.
 UP, YAW = 1, 4
-#: Types of innovations.
-POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
-#: First indices in the filter's memory between runs, and its size: whether the last receiver solution was fixed (-1: no
+#: First indices in the filter's memory between runs: whether the last receiver solution was fixed (-1: no
 #: solution yet), filtered acceleration in world axes, and number of consecutive rejected solutions.
-LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-#: Columns of a logged innovation: time, type, component of the reading, normalised innovation, whether it was used; and
-#: their number.
-LOG_TIME, LOG_TYPE, LOG_AXIS, LOG_NORMALISED, LOG_USED, LOG_COLUMNS = range(6)
+LAST_FIX, FILTERED_ACCELERATION, REJECTED = 0, 1, 4
 
 
 class Tuning(NamedTuple):
@@ -79,7 +74,6 @@ class Inputs(NamedTuple):
 
     - times, step, angles, velocities: boundaries, nominal period and increments of the inertial samples
     - gps, compass: rows of the receiver and of the tilt compass
-    - covariance_indices: boundaries with stored covariances, ascending
     """
 
     times: Array
@@ -88,7 +82,6 @@ class Inputs(NamedTuple):
     velocities: Array
     gps: Array
     compass: Array
-    covariance_indices: NDArray[np.int64]
 
 
 class Estimate(NamedTuple):
@@ -192,13 +185,14 @@ def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, 
 
 
 @njit(cache=True)
-def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, gate: float, log: Array) -> None:
-    """Update with one scalar measurement; gains of considered errors are zero (Schmidt 1966).
+def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, gate: float) -> bool:
+    """Update with one scalar measurement unless it is rejected; return whether it was accepted.
+
+    Gains of considered errors are zero (Schmidt 1966).
 
     - h: derivatives of the measurement with respect to all errors
     - residual, noise: measured minus expected value, and standard deviation of the measurement noise
     - gate: maximum absolute normalised innovation of an accepted measurement
-    - log: output, normalised innovation and whether it was accepted in the last two columns
     """
     state, p = estimate
     ph = np.zeros(ERRORS)
@@ -209,10 +203,8 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
     variance = noise * noise
     for i in range(ERRORS):
         variance += h[i] * ph[i]
-    log[LOG_NORMALISED] = residual / math.sqrt(variance)
-    log[LOG_USED] = 1.0 if abs(log[LOG_NORMALISED]) < gate else 0.0
-    if log[LOG_USED] == 0.0:
-        return
+    if not abs(residual / math.sqrt(variance)) < gate:
+        return False
     # P - K h'P - P h K' + K s K', with K zero for considered errors
     for i in range(ERRORS):
         gain_i = ph[i] / variance if i < ESTIMATED else 0.0
@@ -228,6 +220,7 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
     q = state[QUATERNION : QUATERNION + 4]
     rotation = correction[ATTITUDE_ERROR : ATTITUDE_ERROR + 3]
     _multiply(_quaternion_from_vector(rotation), (q[0], q[1], q[2], q[3]), q)
+    return True
 
 
 @njit(cache=True)
@@ -264,29 +257,29 @@ def _restart(estimate: Estimate, row: Array, tuning: Tuning) -> None:
 
 
 @njit(cache=True)
-def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tuning: Tuning, log: Array) -> None:
-    """Update with a solution and the displacement and velocity `change` since its time tag; write six innovations."""
+def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tuning: Tuning) -> bool:
+    """Update with a solution and the displacement and velocity `change` since its time tag.
+
+    Return whether all six components were accepted.
+    """
     state, _ = estimate
-    h = np.empty(ERRORS)
+    h, all_accepted = np.empty(ERRORS), True
     for i in range(3):
         h[:] = 0.0
         h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
-        log[i, LOG_TIME], log[i, LOG_TYPE], log[i, LOG_AXIS] = time, POSITION_FIX, i
         residual = row[GPS_POSITION + i] + change[i] - state[POSITION + i]
-        update_scalar(estimate, h, residual, row[GPS_NOISE + i], tuning.gate, log[i])
+        all_accepted &= update_scalar(estimate, h, residual, row[GPS_NOISE + i], tuning.gate)
     for i in range(3):
         h[:] = 0.0
         h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
-        log[3 + i, LOG_TIME], log[3 + i, LOG_TYPE], log[3 + i, LOG_AXIS] = time, VELOCITY_FIX, i
         residual = row[GPS_VELOCITY + i] + change[3 + i] - state[VELOCITY + i]
-        update_scalar(estimate, h, residual, tuning.velocity_noise_m_s[i], tuning.gate, log[3 + i])
+        all_accepted &= update_scalar(estimate, h, residual, tuning.velocity_noise_m_s[i], tuning.gate)
+    return all_accepted
 
 
 @njit(cache=True)
-def update_tilt(
-    row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
-) -> None:
-    """Update with the x and y components of the inclinometers' up direction; write two innovations.
+def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, tuning: Tuning) -> None:
+    """Update with the x and y components of the inclinometers' up direction.
 
     `disturbance_rad` is the standard deviation of the tilt error that accelerations cause.
     """
@@ -295,26 +288,22 @@ def update_tilt(
         write_rotation_matrix(estimate.state[QUATERNION:], matrix)
         h[:] = 0.0
         h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
-        log[i, LOG_TIME], log[i, LOG_TYPE], log[i, LOG_AXIS] = time, INCLINOMETER, i
         noise = math.hypot(tuning.tilt_noise_rad, disturbance_rad)
-        update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, tuning.gate, log[i])
+        update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, tuning.gate)
 
 
 @njit(cache=True)
-def update_heading(
-    row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
-) -> None:
-    """Update with the yaw of the compass; write one innovation. `disturbance_rad`: see `update_tilt`."""
+def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, tuning: Tuning) -> None:
+    """Update with the yaw of the compass; `disturbance_rad`: see `update_tilt`."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     write_rotation_matrix(estimate.state[QUATERNION:], matrix)
     horizontal = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
     h[ATTITUDE_ERROR] = -matrix[2, 0] * matrix[0, 0] / horizontal
     h[ATTITUDE_ERROR + 1] = -matrix[2, 0] * matrix[1, 0] / horizontal
     h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
-    log[0, LOG_TIME], log[0, LOG_TYPE], log[0, LOG_AXIS] = time, COMPASS, 0
     residual = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
     noise = math.hypot(tuning.heading_noise_rad, tuning.tan_dip * disturbance_rad)
-    update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, tuning.gate, log[0])
+    update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, tuning.gate)
 
 
 @njit(cache=True)
@@ -334,18 +323,16 @@ def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t
 
 
 @njit(cache=True)
-def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -> tuple[Array, Array, Array]:
-    """Run the filter; return states, stored covariances, and innovations.
+def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -> Array:
+    """Run the filter; return the state at each boundary.
 
     `memory` and the covariance `p` are updated in place. Readings with tags before the first boundary are ignored.
     """
-    times, gps, compass, indices = inputs.times, inputs.gps, inputs.compass, inputs.covariance_indices
+    times, gps, compass = inputs.times, inputs.gps, inputs.compass
     states = np.empty((times.size, STATE))
     # position and velocity change since the start of the run, from the inertial unit only
     inertial = np.zeros((times.size, 6))
-    covariances = np.empty((indices.size, ESTIMATED, ESTIMATED))
-    log = np.empty((6 * gps.shape[0] + 3 * compass.shape[0], LOG_COLUMNS))
-    log_count = next_fix = next_reading = covariance_count = 0
+    next_fix = next_reading = 0
     states[0] = start
     for k in range(times.size):
         state = states[k]
@@ -368,9 +355,8 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
             fix_change[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
             if memory[REJECTED] >= tuning.max_rejected_fixes:
                 _restart(estimate, row, tuning)
-            update_fix(row, estimate, fix_change, times[k], tuning, log[log_count : log_count + 6])
-            memory[REJECTED] = 0.0 if log[log_count : log_count + 6, LOG_USED].all() else memory[REJECTED] + 1.0
-            log_count += 6
+            is_accepted = update_fix(row, estimate, fix_change, times[k], tuning)
+            memory[REJECTED] = 0.0 if is_accepted else memory[REJECTED] + 1.0
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
         acceleration = math.sqrt(east**2 + north**2 + tuning.unmodelled_acceleration_m_s2**2)
         disturbance_rad = tuning.disturbance * acceleration / tuning.gravity_m_s2
@@ -380,12 +366,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):
-                update_tilt(row, estimate, disturbance_rad, times[k], tuning, log[log_count : log_count + 2])
-                log_count += 2
+                update_tilt(row, estimate, disturbance_rad, tuning)
             if not math.isnan(row[YAW]):
-                update_heading(row, estimate, disturbance_rad, times[k], tuning, log[log_count : log_count + 1])
-                log_count += 1
-        while covariance_count < indices.size and indices[covariance_count] == k:
-            covariances[covariance_count] = p[:ESTIMATED, :ESTIMATED]
-            covariance_count += 1
-    return states, covariances, log[:log_count]
+                update_heading(row, estimate, disturbance_rad, tuning)
+    return states

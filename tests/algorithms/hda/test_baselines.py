@@ -5,10 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions
-from marsyard.algorithms.hda.essential_matrix import essential_motion
+from marsyard.algorithms.hda.baselines import (
+    SemiGlobalEstimator,
+    essential_motion,
+    rectify_views,
+    semi_global_structure,
+)
 from marsyard.algorithms.hda.estimator import motion_from_tracks
 from marsyard.algorithms.hda.scene import LandingScene, build_scene
-from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator, rectify_views, semi_global_structure
 from marsyard.algorithms.hda.tracking import select_features, track_features
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid

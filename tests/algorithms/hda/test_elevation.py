@@ -6,8 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.elevation import elevation_map
-from marsyard.algorithms.hda.scene import CameraView
-from marsyard.algorithms.hda.surface_frame import plane_normal, surface_from_camera, up_direction, world_from_surface
+from marsyard.algorithms.hda.scene import (
+    CameraView,
+    plane_normal,
+    surface_from_camera,
+    up_direction,
+    world_from_surface,
+)
 from marsyard.sim.camera import camera_pose
 from tests.algorithms.hda.relief_scene import make_camera, make_pose
 

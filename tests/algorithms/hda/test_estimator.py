@@ -18,9 +18,8 @@ from marsyard.algorithms.hda import (
     TrackSeed,
     hda_products,
 )
-from marsyard.algorithms.hda.essential_matrix import EssentialMatrixEstimator
+from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
-from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement
@@ -188,25 +187,8 @@ def test_sites_are_reported_in_map_coordinates(measurements: LandingMeasurements
         )
     )
     np.testing.assert_allclose(get_site(result), map_from_world.apply(get_site(estimate)), atol=1e-6)
-
-
-def test_position_error_shifts_the_site_equally(measurements: LandingMeasurements, estimate: SiteEstimate) -> None:
-    shift = np.array([1.5, -0.7, 0.2])
-    poses = tuple(
-        PoseMeasurement(rigid(Rotation.identity(), shift) * pose.world_from_body, pose.time_s)
-        for pose in measurements.poses
-    )
-    # The a-priori site comes from map data and only breaks ties.
-    result = HdaEstimator(OPTIONS).estimate(replace(measurements, poses=(poses[0], poses[1])))
-    np.testing.assert_allclose(get_site(result), get_site(estimate) + shift, atol=1e-6)
-
-
-@all_estimators
-def test_estimate_is_deterministic(name: str, measurements: LandingMeasurements) -> None:
-    first, second = (ESTIMATORS[name](OPTIONS).estimate(measurements) for _ in range(2))
-    np.testing.assert_array_equal(first.site_world, second.site_world)
-    for key, value in hda_products(get_details(first)).items():
-        np.testing.assert_array_equal(hda_products(get_details(second))[key], value)
+    # the a-priori site is in the same cell of both maps
+    np.testing.assert_allclose(get_ground(result).apriori_cell, get_ground(estimate).apriori_cell, atol=1e-6)
 
 
 def is_apriori_site(result: SiteEstimate, inputs: LandingMeasurements) -> bool:
@@ -257,18 +239,6 @@ def test_zero_baseline_is_reported(measurements: LandingMeasurements) -> None:
     result = HdaEstimator(OPTIONS).estimate(static_measurements)
     assert result.outcome is SiteOutcome.NO_BASELINE
     assert is_apriori_site(result, static_measurements)
-
-
-def test_pure_rotation_is_reported() -> None:
-    # The rotation is about the camera centre, which is at (0.3, 0, -0.1) in the body.
-    first = make_pose(0.0, 0.0, 10.0, 5.0)
-    rotation = Rotation.from_euler("zyx", [3.0, 2.0, -2.0], degrees=True)
-    centre = np.array([0.3, 0.0, -0.1])
-    second = first * rigid(rotation, centre - rotation.apply(centre))
-    inputs = measure_pass(Pass(make_pass().height, (first, second)), np.random.default_rng(2))
-    result = HdaEstimator(OPTIONS).estimate(inputs)
-    assert result.outcome is SiteOutcome.NO_BASELINE
-    assert is_apriori_site(result, inputs)
 
 
 def test_independently_moving_blocks_have_no_common_motion(measurements: LandingMeasurements) -> None:
@@ -357,13 +327,6 @@ def test_map_does_not_depend_on_image_brightness(scene: Pass, measurements: Land
         darker = replace_image(darker, index, (measurements.images[index].counts // 4).astype(np.uint16))
     errors = compute_map_errors(scene, HdaEstimator(OPTIONS).estimate(darker))
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
-
-
-def test_repeated_first_image_has_no_baseline(measurements: LandingMeasurements) -> None:
-    # A dropped frame: the second image equals the first, but the poses differ.
-    inputs = replace_image(measurements, 1, measurements.images[0].counts)
-    result = HdaEstimator(OPTIONS).estimate(inputs)
-    assert result.outcome is SiteOutcome.NO_BASELINE
 
 
 def test_map_tolerates_detector_noise(scene: Pass) -> None:

@@ -8,11 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.algorithms.hda import HdaOptions, Safety, hazard_maps, safe_site
-from marsyard.algorithms.hda.elevation import ElevationMap, elevation_map, fill_small_holes
-from marsyard.algorithms.hda.footprints import Resolution, classify_footprints, roughness_limit_m
-from marsyard.algorithms.hda.hazards import safe_landing_map, smooth_surface
+from marsyard.algorithms.hda.elevation import ElevationMap, elevation_map, fill_small_holes, grassfire
+from marsyard.algorithms.hda.hazards import (
+    Resolution,
+    classify_footprints,
+    roughness_limit_m,
+    safe_landing_map,
+    smooth_surface,
+)
 from marsyard.algorithms.hda.kernels.elevation import robust_plane
-from marsyard.algorithms.hda.morphology import grassfire
 
 CELL_M = 0.1
 OPTIONS = HdaOptions(
@@ -158,27 +162,18 @@ def test_hazards_are_dilated_by_lander_disc(row: int, column: int, growth: float
     np.testing.assert_array_equal((safety == Safety.HAZARD)[unambiguous], expected[unambiguous])
 
 
-def test_cells_near_borders_and_holes_are_unknown() -> None:
+@pytest.mark.parametrize(("diameter_m", "growth"), [(1.0, 0.5), (1.5, 0.61)])
+def test_cells_near_borders_and_holes_are_unknown(diameter_m: float, growth: float) -> None:
     slope = np.zeros((80, 100))
     slope[40, 50] = np.nan
-    safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
-    rows, columns = np.indices((80, 100))
-    # Half a diameter is 5 cells; the cells around the map are unknown.
-    from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
-    unknown = (from_border <= 5) | (np.hypot(rows - 40, columns - 50) <= 5.0)
-    np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
-
-
-def test_unknown_region_grows_with_lander_diameter() -> None:
-    slope = np.zeros((80, 100))
-    slope[40, 50] = np.nan
-    options = replace(OPTIONS, lander_diameter_m=1.5, unknown_growth=0.6)
+    options = replace(OPTIONS, lander_diameter_m=diameter_m, unknown_growth=growth)
     safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, options)
     rows, columns = np.indices((80, 100))
-    distance = np.hypot(rows - 40, columns - 50)
-    inner = (slice(15, 65), slice(15, 85))
-    unambiguous = (np.abs(distance - 9.0) > 1e-6)[inner]  # 0.6 of 1.5 m are 9 cells
-    np.testing.assert_array_equal((safety == Safety.UNKNOWN)[inner][unambiguous], (distance < 9.0)[inner][unambiguous])
+    # half a diameter is 5 cells, or 0.61 of 1.5 m are 9.15 cells; the cells around the map are unknown
+    near_cells = 10.0 * growth * diameter_m
+    from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
+    unknown = (from_border <= near_cells) | (np.hypot(rows - 40, columns - 50) <= near_cells)
+    np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
 
 
 def test_hazard_takes_precedence_over_unknown() -> None:
@@ -217,7 +212,6 @@ def test_site_has_maximum_distance_to_unsafe_cells() -> None:
     unsafe_cells = np.argwhere(is_unsafe) - 1
     cells = np.moveaxis(np.indices(safety.shape), 0, -1).reshape(-1, 1, 2)
     distances = np.linalg.norm(cells - unsafe_cells, axis=-1).min(axis=1).reshape(safety.shape)
-    assert site is not None
     assert distances[site] == pytest.approx(distances.max())
 
 

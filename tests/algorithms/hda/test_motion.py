@@ -132,18 +132,6 @@ def test_best_of_two_initial_motions_is_selected() -> None:
         assert motion_errors(result, true_motion, depths[0] / result.depths[0])[0] < 1e-6
 
 
-def test_scaling_does_not_change_residuals() -> None:
-    rng = np.random.default_rng(6)
-    points, depths = make_tracks(rng, 0.02)
-    result = solve_motion(points, project_points(points, depths, draw_motion(rng))).scale(3.0)
-    assert result.depths.mean() == pytest.approx(30.0, rel=0.3)
-    np.testing.assert_allclose(
-        project_points(points, result.depths, result.second_from_first),
-        project_points(points, result.depths / 3.0, result.scale(1.0 / 3.0).second_from_first),
-        atol=1e-12,
-    )
-
-
 @pytest.mark.parametrize("rotation_vector", [(0.0, 0.0, 0.0), (0.05, -0.03, 0.1)])
 @pytest.mark.parametrize("noise_px", [0.0, 0.1])
 def test_pure_rotation_has_no_baseline(rotation_vector: tuple[float, float, float], noise_px: float) -> None:

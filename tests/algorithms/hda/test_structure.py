@@ -13,7 +13,6 @@ from marsyard.algorithms.hda.scene import LandingScene, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
-    depth_bounds,
     epipolar_segments,
     forward_backward_error,
     grid_spacing_px,
@@ -119,13 +118,6 @@ def test_matches_and_depths_equal_exact_scene(scene: Pass, landing_scene: Landin
     assert np.sqrt(np.mean(depth_errors**2)) < 0.005 * 10.0
 
 
-def test_grid_keeps_search_windows_inside_the_image(scene: Pass, landing_scene: LandingScene) -> None:
-    matches = dense_structure(landing_scene.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, grid_px=1))
-    border = OPTIONS.search_half_px + 1
-    assert matches.first.min() >= border
-    assert np.all(matches.first <= np.array([320, 240]) - 1 - border)
-
-
 def test_plane_of_features_determines_scale_without_local_matches(scene: Pass, landing_scene: LandingScene) -> None:
     rng = np.random.default_rng(8)
     positions = rng.uniform(-0.3, 0.3, (30, 2))
@@ -163,10 +155,6 @@ def test_triangulation_is_exact_and_precision_follows_parallax() -> None:
 def test_diverging_lines_of_sight_have_no_depth() -> None:
     positions = np.array([[0.1, 0.2]])
     assert np.isnan(triangulate(positions, positions, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
-
-
-def test_depth_bounds_are_widened_on_both_sides() -> None:
-    assert depth_bounds((8.0, 12.0), 0.25) == (6.0, 15.0)
 
 
 def test_grid_is_centred_with_a_border() -> None:

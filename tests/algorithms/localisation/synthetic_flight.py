@@ -81,5 +81,4 @@ def list_outcomes(estimates: Sequence[PositionEstimate]) -> list[PositionOutcome
 
 
 def position_error_m(estimate: PositionEstimate) -> float:
-    assert estimate.position_m is not None
     return float(np.linalg.norm(estimate.position_m - true_position(estimate.time_s)))

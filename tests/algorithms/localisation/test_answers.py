@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.localisation.answers import check_estimate
+from marsyard.algorithms.localisation.exchange import check_estimate
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 
 SPAN_S = (-0.2, 40.0)  #: First and last time of the inertial increments.

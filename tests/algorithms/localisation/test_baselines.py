@@ -5,7 +5,7 @@ import numpy as np
 import scipy.ndimage
 from scipy.spatial import cKDTree
 
-from marsyard.algorithms.localisation.features import MAX_DISTANCE_RATIO, extract_map_features, match_descriptors
+from marsyard.algorithms.localisation.sift_pose import MAX_DISTANCE_RATIO, extract_map_features, match_descriptors
 
 
 def test_features_of_strips_are_those_of_the_whole_map() -> None:

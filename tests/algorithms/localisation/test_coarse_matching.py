@@ -67,9 +67,8 @@ def test_exact_images_determine_an_offset_of_three_kilometres() -> None:
     assert isinstance(fix, CoarseFix)
     # without noise: a tenth of a coarse pixel of 12 m; required: 100 m
     np.testing.assert_allclose(fix.offset_m, OFFSET_M, atol=1.2)
-    assert fix.matches.consistent.sum() >= 14
-    assert fix.second_support == 0.0
-    np.testing.assert_allclose(fix.matches.map_m - fix.matches.predicted_m, np.tile(OFFSET_M, (15, 1)), atol=12.0)
+    # the errors of the fix are much smaller than a patch's tolerance of 60 m
+    assert np.sqrt(np.diag(fix.covariance)).max() < 20.0
 
 
 def test_an_offset_at_the_limit_of_the_initial_error_is_found() -> None:
@@ -112,9 +111,8 @@ def test_a_wrong_attitude_is_refused() -> None:
 def test_an_attitude_within_the_stated_error_is_accepted() -> None:
     fix = run_coarse_stage(tilt_attitudes(random_images(), 0.1), make_scene().map_product, NEAR_M)
     assert isinstance(fix, CoarseFix)
-    assert fix.consistency is not None
-    assert fix.consistency.is_consistent
-    assert fix.consistency.members.all()
+    error = fix.offset_m - NEAR_M
+    assert error @ np.linalg.solve(fix.covariance, error) < 13.8  # 99.9 % of chi-square with two degrees of freedom
 
 
 @pytest.mark.parametrize("seed", [11, 12])

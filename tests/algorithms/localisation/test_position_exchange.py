@@ -184,21 +184,8 @@ def test_process_answers_one_descent_or_many_in_order_of_messages(tmp_path: Path
     assert not any(Path(f"/proc/{number}").exists() for number in (serving, single))
 
 
-def test_an_estimator_starts_again_in_the_same_process(tmp_path: Path) -> None:
-    limits = ExecutableLimits(time_s=60.0)
-    estimator: Any = LOCALISATION.make(f"serve-stream:{write_plain(tmp_path, 'pass')}", LvsOptions(), limits)
-    first, second = (estimator.estimate(DESCENT) for _ in range(2))
-    assert first.outcome is second.outcome is PositionOutcome.NO_COARSE_FIX
-
-
 #: A line for `PLAIN` that makes the answers to image and finish valid.
 VALID = 'answer = {**STATE, "outcome": "VALID", "time_s": 0.5} if "outcome" in answer and answer["outcome"] else answer'
-
-
-def test_valid_answer_of_a_plain_program(tmp_path: Path) -> None:
-    final = run(f"serve:{write_plain(tmp_path, VALID)}").estimates[-1]
-    assert final.outcome is PositionOutcome.VALID
-    np.testing.assert_array_equal(final.position_m, [1.0, 2.0, 3.0])
 
 
 IF_IMAGE = "if request['do'] == 'process_image': "
@@ -208,12 +195,9 @@ IF_IMAGE = "if request['do'] == 'process_image': "
     ("body", "fault", "message"),
     [
         ("if request['do'] == 'start': sys.exit(3)", Fault.CRASHED, "status 3"),
-        ("if request['do'] == 'process_altitude': raise ValueError", Fault.CRASHED, "status 1"),
         (f"{IF_IMAGE}sys.exit(0)", Fault.CRASHED, "its output ended without an answer"),
         (f"{IF_IMAGE}time.sleep(60)", Fault.TIMED_OUT, "no answer within 0.5 s"),
-        ("if request['do'] == 'process_increments': time.sleep(60)", Fault.TIMED_OUT, "no answer within 0.5 s"),
         (f"{IF_IMAGE}print('position unknown')", Fault.BAD_ANSWER, "one line|not one JSON object"),
-        (f"{IF_IMAGE}request['id'] = 1", Fault.BAD_ANSWER, "the answer's id is 1; allowed: "),
         ("if request['do'] == 'start': answer = ANSWER", Fault.BAD_ANSWER, "unknown key 'time_s'"),
         ("if request['do'] == 'process_increments': answer = {}", Fault.BAD_ANSWER, "None; .* allowed: null"),
         (f"{IF_IMAGE}answer = {{'outcome': None}}", Fault.BAD_ANSWER, "is a NoneType; allowed: a Posi"),

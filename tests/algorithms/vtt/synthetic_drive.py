@@ -178,6 +178,7 @@ class Drive:
     noise: np.random.Generator | None = None
     pointing_error_rad: tuple[float, float] = (0.0, 0.0)
     measurements: list[RoverMeasurements] = field(default_factory=list)
+    updates: list[TargetUpdate] = field(default_factory=list)
 
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
         """Return the camera in the world frame for mast angles (azimuth, elevation), radians."""
@@ -203,7 +204,8 @@ class Drive:
                 world_from_rover=rover_estimate,
             )
         )
-        return self.tracker.update(self.measurements[-1])
+        self.updates.append(self.tracker.update(self.measurements[-1]))
+        return self.updates[-1]
 
     def true_pixel(self, true_pose: RigidTransform, point_world: np.ndarray) -> np.ndarray:
         """Project a world point into the left image of the last stop, with the true pose and mast angles."""
@@ -240,23 +242,29 @@ def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
     return Scene((body,), draw_waves(seed, count=100), target)
 
 
-def start_drive(target: np.ndarray, seed: int) -> Drive:
-    """Create a drive to a face, designate the target at the start, and stop there."""
-    drive = Drive(make_scene(make_face(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
+def start_drive(
+    target: np.ndarray,
+    seed: int,
+    options: VttOptions = SMALL_WINDOW,
+    mast: MastCalibration | None = None,
+    mast_model: MastCalibration | None = None,
+    face: Plane | None = None,
+) -> Drive:
+    """Create a drive to a face (a random one by default), designate the target at the start, and stop there."""
+    scene = make_scene(make_face(seed, target) if face is None else face, target, seed)
+    drive = Drive(scene, navcam() if mast is None else mast, VisualTargetTracker(options), mast_model)
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     return drive
 
 
 def get_details(update: TargetUpdate | None) -> VttDetails:
-    assert update is not None
     assert isinstance(update.details, VttDetails)
     return update.details
 
 
 def get_pixel(update: TargetUpdate | None) -> np.ndarray:
     match = get_details(update).match
-    assert match is not None
     return match.pixel
 
 

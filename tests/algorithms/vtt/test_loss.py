@@ -17,10 +17,16 @@ from marsyard.algorithms.vtt.accuracy import (
     table_1,
     tracked_approach_error_m,
 )
-from marsyard.algorithms.vtt.arm_target import GoalCriterion, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.arm import (
+    GoalCriterion,
+    HandOffOutcome,
+    PlacementOutcome,
+    hand_off,
+    place_instrument,
+    tool_overlap_m,
+)
 from marsyard.algorithms.vtt.losses import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
@@ -157,10 +163,9 @@ def test_instrument_is_placed_on_flat_ground() -> None:
 def test_target_next_to_a_step_is_reselected_away_from_it() -> None:
     """The tools reach 5 cm: with a step of 3 cm at 4.5 cm they collide, 6 mm away they do not."""
     surface = make_surface(0.045, 0.03)
-    assert tool_overlap_m(surface, TARGET, np.array([0.0, 0.0, 1.0]), Instrument()) == pytest.approx(0.015)
+    assert tool_overlap_m(surface, TARGET, np.array([0.0, 0.0, 1.0])) == pytest.approx(0.015)
     placement = place_instrument(surface, TARGET, VIEWPOINT)
     assert placement.outcome is PlacementOutcome.RESELECTED
-    assert placement.position_rover is not None
     moved = placement.position_rover - TARGET
     assert 0.004 <= -moved[0] <= 0.008
     # the nearest free position is chosen
@@ -179,7 +184,7 @@ def test_too_few_points_are_no_surface() -> None:
     ring = make_surface()
     ring = ring[np.linalg.norm(ring - TARGET, axis=1) > 0.035]
     assert place_instrument(ring, TARGET, VIEWPOINT).outcome is PlacementOutcome.NO_SURFACE
-    assert np.isnan(tool_overlap_m(ring, TARGET, np.array([0.0, 0.0, 1.0]), Instrument()))
+    assert np.isnan(tool_overlap_m(ring, TARGET, np.array([0.0, 0.0, 1.0])))
 
 
 def test_table_1_matches_printed_digits() -> None:

@@ -8,9 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TrackingState
-from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
-from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker, lucas_kanade_tracker
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.measurements import MastImage, PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 from tests.algorithms.vtt.synthetic_drive import (
@@ -54,7 +53,6 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
         assert last.tracked
         assert get_details(last).distance_m < 2.05
         drifts.append(get_pixel(last) - drive.true_pixel(true_pose, target))
-        assert last.position_rover is not None
         # One tenth of the required 3 cm, with exact poses and cameras.
         assert np.linalg.norm(last.position_rover - true_pose.inv().apply(target)) < 0.003
         for (_, previous), (_, current) in pairwise(stops):
@@ -115,11 +113,7 @@ def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
 @pytest.mark.parametrize("roll", [True, False])
 def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     target = np.array([5.0, 0.1, 0.3])
-    drive = Drive(
-        make_scene(make_face(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, roll=roll))
-    )
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 1, replace(SMALL_WINDOW, roll=roll))
     # The body tilts by 25 deg to its right: its image rolls counter-clockwise by about the same angle.
     tilted_pose = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
     update = drive.stop(tilted_pose)
@@ -208,10 +202,7 @@ def test_all_three_designations_define_the_same_target() -> None:
 def test_range_of_a_near_target_is_accurate_if_the_mast_centres_both_images() -> None:
     """With `aim_pair` the target is between the centres of both images, so that both contain a target at 2.2 m."""
     target = np.array([2.2, -0.1, 0.3])
-    options = replace(SMALL_WINDOW, aim_pair=True)
-    drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    update = drive.stop(pose(0.0, 0.0))
+    (update,) = start_drive(target, 6, replace(SMALL_WINDOW, aim_pair=True), pancam()).updates
     assert update.position_rover is not None
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
@@ -222,9 +213,7 @@ def test_warp_increases_the_stereo_score_of_a_slanted_face() -> None:
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
     for warp in ("shift", "bend"):
-        drive = Drive(make_scene(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, warp=warp)))
-        drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        stereo = get_details(drive.stop(pose(0.0, 0.0))).stereo
+        stereo = get_details(start_drive(target, 3, replace(SMALL_WINDOW, warp=warp), face=face).updates[0]).stereo
         scores[warp] = 0.0 if stereo is None else stereo.score
     assert scores["bend"] > 0.95
     assert scores["shift"] < scores["bend"] - 0.1
@@ -272,7 +261,6 @@ def test_pointing_error_does_not_change_the_match() -> None:
     update = drive.stop(pose(0.5, 0.0))
     assert update.tracked
     result = get_details(update)
-    assert result.predicted_pixel is not None
     # 0.82 mrad per pixel: pointing too far right and down moves the target left and up.
     correction = get_pixel(update) - result.predicted_pixel
     np.testing.assert_allclose(correction, [-1222.5 * np.deg2rad(0.5), -1222.5 * np.deg2rad(0.3)], atol=0.5)
@@ -286,11 +274,7 @@ def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_p
     mast = navcam()
     assert isinstance(mast.right, Cahvor)
     misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + row_offset_px * mast.right.a))
-    drive = Drive(
-        make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL_WINDOW), mast_model=misaligned
-    )
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    update = drive.stop(pose(0.0, 0.0))
+    (update,) = start_drive(target, 5, mast=mast, mast_model=misaligned).updates
     assert update.tracked == is_tracked
     if is_tracked:
         # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
@@ -302,10 +286,7 @@ def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_p
 def test_spinning_wheels_are_detected() -> None:
     # The estimated drive is 1.5 m of 8 m. The target is still 8 m away, and its image is not magnified.
     target = np.array([8.0, 0.1, 0.2])
-    tracker = VisualTargetTracker(replace(SMALL_WINDOW, search_px=161))
-    drive = Drive(make_scene(make_face(8, target), target, 8), navcam(), tracker)
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 8, replace(SMALL_WINDOW, search_px=161))
     update = drive.stop(pose(0.0, 0.0), pose(1.5, 0.0))
     assert update.state is TrackingState.LOST
 
@@ -369,11 +350,8 @@ def hide_behind_board(scene: Scene) -> Scene:
 )
 def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], expected: list[TrackingState]) -> None:
     target = np.array([6.0, 0.1, 0.2])
-    clear_scene = make_scene(make_face(3, target), target, 3)
-    tracker = VisualTargetTracker(SMALL_WINDOW)
-    drive = Drive(clear_scene, navcam(), tracker)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 3)
+    tracker, clear_scene = drive.tracker, drive.scene
     states = []
     for stop in (1, 2, 3):
         drive.scene = hide_behind_board(clear_scene) if stop in occluded_stops else clear_scene

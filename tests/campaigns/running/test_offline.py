@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import pytest
 
-from marsyard.algorithms.dimes.homography import HomographyEstimator
+from marsyard.algorithms.dimes.baselines import HomographyEstimator
 from marsyard.algorithms.exchange import read_case
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.campaigns.definition.campaign import Campaign

@@ -8,13 +8,14 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
+from marsyard.reports.assurance.argument import ElementKind, GoalState, number_elements
 from marsyard.reports.assurance.case import AssuranceCase, build_case
-from marsyard.reports.assurance.elements import ElementKind, GoalState, number_elements
 from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
@@ -73,37 +74,24 @@ def change_table(folder: Path) -> None:
     frame.to_parquet(path)
 
 
-def change_verdict(folder: Path) -> None:
-    path = folder / RUN / "report.json"
-    report = json.loads(path.read_text())
-    report["verdicts"][0]["failures"] += 1
-    path.write_text(json.dumps(report))
+def edit_json(name: str, edit: Callable[[Any], None]) -> Callable[[Path], None]:
+    """Return a change of the content of a JSON file of the campaign."""
+
+    def change(folder: Path) -> None:
+        path = folder / RUN / name
+        content = json.loads(path.read_text())
+        edit(content)
+        path.write_text(json.dumps(content))
+
+    return change
 
 
-def change_validity(folder: Path) -> None:
-    path = folder / RUN / "report.json"
-    report = json.loads(path.read_text())
-    report["validity"]["missed"] = []
-    path.write_text(json.dumps(report))
+def edit_text(name: str, old: str, new: str) -> Callable[[Path], None]:
+    """Return a change of the text of a file of the package."""
+    return lambda folder: replace_text(folder / name, old, new)
 
 
-def change_robustness(folder: Path) -> None:
-    path = folder / RUN / "report.json"
-    report = json.loads(path.read_text())
-    report["robustness"][0]["passes_at"] = 20.0
-    path.write_text(json.dumps(report))
-
-
-def change_statement(folder: Path) -> None:
-    replace_text(folder / CASE, "supported, with open defeaters", "supported")
-
-
-def change_drawing(folder: Path) -> None:
-    replace_text(folder / "case.svg", "not shown", "supported")
-
-
-def change_page(folder: Path) -> None:
-    replace_text(folder / "index.html", "Not shown", "Supported")
+change_page = edit_text("index.html", "Not shown", "Supported")
 
 
 def change_validation_row(folder: Path) -> None:
@@ -116,13 +104,6 @@ def change_validation_row(folder: Path) -> None:
 def change_requirement(folder: Path) -> None:
     path = folder / RUN / "campaign.json"
     path.write_text(path.read_text().replace('"probability": 0.99', '"probability": 0.9'))
-
-
-def change_definition(folder: Path) -> None:
-    path = folder / RUN / "campaign.json"
-    record = json.loads(path.read_text())
-    record["definition"]["seed"] += 1
-    path.write_text(json.dumps(record))
 
 
 def test_package_verifies(package: Path) -> None:
@@ -138,14 +119,26 @@ def test_package_verifies(package: Path) -> None:
     [
         (change_row, "the row of case 7 was changed"),
         (change_table, f"{RUN}: {RUN}/cases.parquet was changed"),
-        (change_verdict, f"{RUN}/report.json: DIMES-VEL does not follow from the rows: failures"),
-        (change_validity, f"{RUN}/report.json: validity does not follow from the rows"),
-        (change_robustness, f"{RUN}/report.json: robustness does not follow from the rows"),
-        (change_statement, "case.json: element G"),
-        (change_drawing, "case.svg: the content does not follow"),
+        (
+            edit_json("report.json", lambda report: report["verdicts"][0].update(failures=9)),
+            f"{RUN}/report.json: DIMES-VEL does not follow from the rows: failures",
+        ),
+        (
+            edit_json("report.json", lambda report: report["validity"].update(missed=[])),
+            f"{RUN}/report.json: validity does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report["robustness"][0].update(passes_at=20.0)),
+            f"{RUN}/report.json: robustness does not follow from the rows",
+        ),
+        (edit_text(CASE, "supported, with open defeaters", "supported"), "case.json: element G"),
+        (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
         (change_validation_row, "index.html: the content does not follow"),
-        (change_definition, f"{RUN}/campaign.json: the definition is not the one with which the rows were stored"),
+        (
+            edit_json("campaign.json", lambda record: record["definition"].update(seed=8)),
+            f"{RUN}/campaign.json: the definition is not the one with which the rows were stored",
+        ),
         (
             change_requirement,
             f"{RUN}/report.json: DIMES-VEL does not follow from the rows: probability 0.99, from the rows",

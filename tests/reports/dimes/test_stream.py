@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.dimes.stream_case import draw_stream_case, is_stream_case, view_stream
+from marsyard.reports.presentation import write_case_figures
 
 N_IMAGES = 4
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex, to_rgb
 
-from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.case_figures import (
     BLACK,
@@ -28,6 +27,7 @@ from marsyard.reports.hda.case_figures import (
 )
 from marsyard.reports.hda.presentation import view
 from marsyard.reports.hda.products import is_hda_case, read_ground_truth, read_landing_maps
+from marsyard.reports.presentation import write_case_figures
 
 
 def test_all_figures_of_a_complete_case_are_written(hda_products: dict[str, Any], tmp_path: Path) -> None:

@@ -10,17 +10,33 @@ import pytest
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.effects import estimate_effects
-from marsyard.reports.empty_cells import drop_empty_columns
-from marsyard.reports.hda.answers import distance_grid, hazard_distances, outcome_counts, site_fractions
-from marsyard.reports.hda.classes import count_hazard_classes, create_class_blocks
-from marsyard.reports.hda.faults_section import FAULT_OUTCOMES, faults_section
 from marsyard.reports.hda.landing_cases import PAPER
-from marsyard.reports.hda.map_section import MAP_CONDITIONS, MAP_ERRORS, map_rows, map_section
-from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
-from marsyard.reports.hda.threshold_section import threshold_section
-from marsyard.reports.hda.tracking_limits import SizeResult, find_knee, tracking_curves
+from marsyard.reports.hda.paper_sections import (
+    SizeResult,
+    find_knee,
+    run_times_section,
+    touchdown_section,
+    tracking_curves,
+)
+from marsyard.reports.hda.sections import (
+    FAULT_OUTCOMES,
+    MAP_CONDITIONS,
+    MAP_ERRORS,
+    faults_section,
+    map_rows,
+    map_section,
+    threshold_section,
+)
+from marsyard.reports.hda.sites_section import (
+    count_hazard_classes,
+    create_class_blocks,
+    distance_grid,
+    hazard_distances,
+    outcome_counts,
+    site_fractions,
+)
 from marsyard.reports.rates import PooledRate, pooled_rate
-from marsyard.reports.section import Subject
+from marsyard.reports.section import Subject, drop_empty_columns
 from marsyard.reports.stored import StoredRun
 from tests.reports.hda.synthetic_landing import landing_frame
 
@@ -35,11 +51,6 @@ def test_rates_pool_footprints_over_flights() -> None:
     assert (rate.hits, rate.total, rate.flights, rate.flights_hit) == (4, 40, 3, 2)
     assert rate.fraction == pytest.approx(0.1)
     assert rate.lower < 0.1 < rate.upper
-
-
-def test_flights_with_one_footprint_are_pooled() -> None:
-    rate = pooled_rate(pd.DataFrame({"hazardous": [1, 0, 1, 1], "footprints": [1, 1, 2, 0]}), "hazardous", "footprints")
-    assert (rate.hits, rate.total, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
 
 
 def test_pooled_rate_interval_covers_the_true_rate() -> None:

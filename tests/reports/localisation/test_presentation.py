@@ -11,13 +11,19 @@ import pytest
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.campaign import write_report
-from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
-from marsyard.reports.localisation.case_figures import draw_errors, draw_landmarks, draw_map, is_localisation_case
-from marsyard.reports.localisation.presentation import LOCALISATION, view
-from marsyard.reports.localisation.sections import conditions_section, position_section
-from marsyard.reports.presentation import find_case_kind, presentations
+from marsyard.reports.localisation.presentation import (
+    LOCALISATION,
+    conditions_section,
+    draw_errors,
+    draw_landmarks,
+    draw_map,
+    is_localisation_case,
+    position_section,
+    view,
+)
+from marsyard.reports.presentation import find_case_kind, presentations, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 from tests.reports.localisation.synthetic_localisation import (

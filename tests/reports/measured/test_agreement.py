@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.case_views import write_case_figures
-from marsyard.reports.measured.matched_pairs import read_matched_pairs
-from marsyard.reports.measured.presentation import MEASURED, agreement_section
-from marsyard.reports.presentation import find_case_kind
+from marsyard.reports.measured.presentation import MEASURED, agreement_section, read_matched_pairs
+from marsyard.reports.presentation import find_case_kind, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.measured.over_map import map_section
-from marsyard.reports.presentation import find_case_kind
+from marsyard.reports.presentation import find_case_kind, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 

@@ -10,10 +10,15 @@ from scipy import stats
 
 from marsyard.reports.statistics import clusters
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import TerrainCounts, max_statistic
+from marsyard.reports.statistics.clusters import (
+    Sizes,
+    TailFunction,
+    TerrainCounts,
+    event_scores,
+    max_statistic,
+    number_terrains,
+)
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.tail_function import TailFunction
-from marsyard.reports.statistics.terrain_sizes import Sizes, count_sizes, event_scores, number_terrains
 
 #: Designs: 8 terrains of 3 cases, 250 of 4, and unequal numbers of cases.
 DESIGNS: dict[str, Sizes] = {
@@ -253,7 +258,3 @@ def test_scores_are_squares_or_rounded_up() -> None:
     assert scores[:4].tolist() == [0, 1, 1, 3]
     assert scores[-1] == 16**2
     assert (np.diff(scores) >= 0).all()
-
-
-def test_sizes_count_terrains() -> None:
-    assert count_sizes(np.array([3, 0, 1, 3])) == ((1, 1), (3, 2))

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.ellipse import ErrorEllipse, error_ellipse
-from marsyard.reports.statistics.error_summary import circular_error
+from marsyard.reports.statistics.error_summary import ErrorEllipse, circular_error, error_ellipse
 
 
 def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:

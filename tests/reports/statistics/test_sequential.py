@@ -63,19 +63,6 @@ def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -
         assert 0.0 < p_verdict <= risk
 
 
-def test_repeated_looks_at_full_risk_pass_too_often() -> None:
-    # If each look uses the full risk of 10 %, more than 15 % of the campaigns pass at the limit of the requirement.
-    rng = np.random.default_rng(4)
-    looks = planned_looks(1000)
-    n_passed = 0
-    for _ in range(400):
-        failure_counts = np.cumsum(rng.random(1000) < 0.1)
-        n_passed += any(
-            proportion_lower(n - int(failure_counts[n - 1]), n, 0.9) >= 0.9 for n in (look.cases for look in looks)
-        )
-    assert n_passed / 400 > 0.15
-
-
 def _simulate_verdicts(
     rng: np.random.Generator, first_cases: int, max_cases: int, pass_test: SequentialTest, fail_test: SequentialTest
 ) -> set[str]:

@@ -9,7 +9,7 @@ from scipy import stats
 
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.weighted import weighted_rates
+from marsyard.reports.statistics.reweighted_rates import weighted_rates
 
 
 @pytest.mark.parametrize(("failures", "n"), [(0, 230), (1, 388), (7, 50), (40, 40)])

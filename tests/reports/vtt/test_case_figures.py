@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from marsyard.reports.case_views import write_case_figures
+from marsyard.reports.presentation import write_case_figures
 from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops
 from marsyard.reports.vtt.case_products import is_vtt_case, read_rover_path, read_stops
 from marsyard.reports.vtt.presentation import view

@@ -5,16 +5,22 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.goal import goal_section, summarize_cameras
-from marsyard.reports.vtt.losses import losses_grid
-from marsyard.reports.vtt.paper import CHECKOUT_1, CHECKOUT_3, PAPER, REGRESSION, TERRAINS
+from marsyard.reports.vtt.accuracy_sections import (
+    goal_section,
+    losses_grid,
+    measured_accuracy,
+    summarize_cameras,
+    table_1_section,
+)
+from marsyard.reports.vtt.paper_sections import (
+    regression_section,
+    single_run_section,
+    terrains_section,
+    updates_section,
+)
 from marsyard.reports.vtt.presentation import VTT
-from marsyard.reports.vtt.regression_section import regression_section
-from marsyard.reports.vtt.sections import single_run_section
 from marsyard.reports.vtt.steps_section import step_rates, steps_section
-from marsyard.reports.vtt.table_1 import measured_accuracy, table_1_section
-from marsyard.reports.vtt.terrains_section import terrains_section
-from marsyard.reports.vtt.updates_section import updates_section
+from marsyard.reports.vtt.tracking_runs import CHECKOUT_1, CHECKOUT_3, PAPER, REGRESSION, TERRAINS
 from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table, set_values
 
 
@@ -159,8 +165,9 @@ def test_updates_are_compared_with_table_3() -> None:
     assert updates_section(make_subject(make_rows(3))) is None
 
 
-def test_table_3_agrees_with_the_text_of_the_paper() -> None:
-    """The stored table has the minimum and maximum values that the text of the paper reports."""
+def test_stored_tables_agree_with_the_sums_and_ranges_of_the_paper() -> None:
+    assert [sum(mode[name] for mode in PAPER["table_4"]) for name in ("updates", "minutes")] == [27, 66]
+    assert [sum(row[name] for row in PAPER["table_2"].values()) for name in ("trials", "failures")] == [26, 2]
     printed_values = {name: list(values.values()) for name, values in PAPER["table_3"].items()}
     ranges = {"match_score": (0.79, 0.94), "magnification": (0.97, 1.04), "roll_change_deg": (0.06, 6.25)}
     assert {name: (min(printed_values[name]), max(printed_values[name])) for name in ranges} == ranges
@@ -197,11 +204,6 @@ def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
     assert [row["Minutes, ours"] for row in table[:4]] == ["2.0", "7.0", "10.0", "4.0"]
 
 
-def test_table_4_has_the_printed_sums() -> None:
-    assert sum(mode["updates"] for mode in PAPER["table_4"]) == 27
-    assert sum(mode["minutes"] for mode in PAPER["table_4"]) == 66
-
-
 def test_terrains_list_failures_and_causes() -> None:
     frame = make_rows(20, incline=["flat ground"] * 8 + ["steep incline"] * 8 + ["a ledge"] * 4)
     frame.loc[[0, 1, 8, 9, 10], "tracked"] = False
@@ -222,11 +224,6 @@ def test_terrains_list_failures_and_causes() -> None:
     assert table["steep incline"]["Stuck: target held"] == "1 of 1: 100 %"
     assert table["flat ground"]["Stuck: target held"] == "–"
     assert terrains_section(make_subject(frame, "another")) is None
-
-
-def test_table_2_has_the_printed_sums() -> None:
-    assert sum(row["trials"] for row in PAPER["table_2"].values()) == 26
-    assert sum(row["failures"] for row in PAPER["table_2"].values()) == 2
 
 
 def test_regression_runs_are_listed_by_driving_mode() -> None:

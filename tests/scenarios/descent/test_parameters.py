@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.algorithms.dimes.binning import binned_size_for
+from marsyard.algorithms.dimes.views import binned_size_for
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld

@@ -206,7 +206,6 @@ class Misbehaving:
     """Velocity estimator that misbehaves in each case."""
 
     def estimate(self, measurements: DescentMeasurements) -> Any:
-        """See `VelocityEstimator`."""
         name = NAME_FILE.read_text()
         if name in ANSWERS:
             return ANSWERS[name]()

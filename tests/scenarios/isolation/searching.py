@@ -49,12 +49,10 @@ class Slow:
         """See `VelocityStream`."""
 
     def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
-        """See `VelocityStream`."""
         time.sleep(0.5)
         return None
 
     def finish(self) -> VelocityEstimate:
-        """See `VelocityStream`."""
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
@@ -62,7 +60,6 @@ class Hanging:
     """Velocity estimator without an answer."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         time.sleep(3600.0)
         raise AssertionError
 
@@ -74,17 +71,14 @@ class Stream:
         self.images = 0
 
     def start(self) -> None:
-        """See `VelocityStream`."""
         self.images = 0
 
     def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
-        """See `VelocityStream`."""
         self.images += 1
         append_line(f"{type(frame).__name__} {self.images}")
         return None
 
     def finish(self) -> VelocityEstimate:
-        """See `VelocityStream`."""
         return VelocityEstimate(VelocityOutcome.VALID, np.array([float(self.images), 0.0]))
 
 
@@ -136,7 +130,6 @@ class Searching:
     """Searches memory and files for numbers; writes those of the magnitude of a velocity."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         found = {number for search in (_search_memory, _search_files) for number in search()}
         numbers = [float(number) for number in found if isinstance(number, float)]
         append_line(" ".join(repr(number) for number in numbers if abs(number) < 1e3))
@@ -147,6 +140,5 @@ class Modules:
     """Writes the names of the modules that its process has loaded."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         append_line("\n".join(sys.modules))
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)

@@ -10,7 +10,7 @@ from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterPa
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m, land
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.sensor import LaserParameters
-from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
 
 GRAVITY_M_S2, HEIGHT_M = 9.8, 10.0
@@ -18,7 +18,7 @@ GRAVITY_M_S2, HEIGHT_M = 9.8, 10.0
 COURSE_RAD = HEADING_RAD = 0.5
 #: Landing site, and level ground of 30 m x 30 m around it with a spacing of 0.5 m.
 SITE = np.array([4.0, 3.0, 0.0])
-GROUND = GroundPatch(SITE[:2] - 15.0, 0.5, np.zeros((61, 61)))
+GROUND = GroundPatch(float(SITE[0]) - 15.0, float(SITE[1]) - 15.0, 0.5, np.zeros((61, 61)))
 #: RTK receiver with floating solutions: errors of half a metre that change slowly.
 FLOATING_RTK: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"hover_s": 8.0}}
 

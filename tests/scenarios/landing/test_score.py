@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
-from marsyard.algorithms.hda.details import MappedGround
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.products import MappedGround
 from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
@@ -170,8 +170,8 @@ def test_answer_without_a_map_has_no_relief_error() -> None:
 
 def test_matches_are_counted_by_outcome() -> None:
     statuses = np.repeat(np.array(list(MatchStatus), dtype=np.uint8), [50, 4, 3, 2])
-    pixels, no_values = np.zeros((59, 2)), np.zeros(59)
-    matches = Matches(pixels, pixels, pixels, pixels, no_values, no_values, statuses, np.zeros((50, 3)))
+    pixels = np.zeros((59, 2))
+    matches = Matches(pixels, pixels, pixels, pixels, np.zeros(59), statuses, np.zeros((50, 3)))
     camera = preset("xc-55").cameras()[0]
     view = CameraView(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
     row = stage_row(HdaDetails((view, view), matches=matches))

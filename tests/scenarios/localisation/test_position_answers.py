@@ -25,13 +25,13 @@ from marsyard.campaigns.running.export_scoring import (
     find_cases_with_changed_images,
 )
 from marsyard.campaigns.running.replay import differing_columns
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.input_copies import hash_inputs
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.offline_files import POSITION_FORMAT, read_descent
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.simulation import LocalisedDescent
 from marsyard.scenarios.localisation.task import LOCALISATION
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows

@@ -11,10 +11,8 @@ import pytest
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.conformance import create_subject
 from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, subject_kinds
-from marsyard.scenarios.conformance.inputs import make_blank
-from marsyard.scenarios.localisation import conformance_inputs as inputs
-from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
-from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+from marsyard.scenarios.localisation import conformance as inputs
+from marsyard.sim.measurements import ImuIncrements
 from tests.scenarios import suites
 
 MODULE_HEADER = """
@@ -183,11 +181,8 @@ for line in sys.stdin:
     ("body", "problem"),
     [
         ("pass", ""),
-        ("sys.exit('the end' if images == 2 else 0)", "CRASHED: "),
         ("sys.exit('the end')", "CRASHED: it ended with status 1; its standard error ends with: the end"),
         ("time.sleep(60)", "TIMED_OUT: no answer within 0.5 s"),
-        ("answer = {'outcome': 'PROBABLY'}", "BAD_ANSWER: outcome is 'PROBABLY'; allowed: VALID, NO_COARSE_FIX"),
-        ("print('here'); answer = {}", "BAD_ANSWER: "),
     ],
 )
 def test_faults_of_programs_are_reported(tmp_path: Path, body: str, problem: str) -> None:
@@ -228,23 +223,3 @@ def test_inertial_data_are_exact() -> None:
     )
     # (160, -110, 20) m is the error of the initial position; the trapezoidal rule is exact for a constant force
     np.testing.assert_allclose(error, [160.0, -110.0, 20.0], atol=1e-3)
-
-
-def test_unusual_descents_differ_as_described() -> None:
-    def select(case: LocalisationMeasurements, kind: type) -> list:
-        return [event for event in case.events() if isinstance(event, kind)]
-
-    images = select(inputs.ordinary_descent(), DetectorImage)
-    assert {float(image.counts.std()) > 5.0 for image in images} == {True}
-    assert len(select(inputs.descent_with_repeated_images(), DetectorImage)) == 2 * len(images)
-    saturated = make_blank(inputs.ordinary_descent(), inputs.BLANK_COUNTS["saturated"])
-    assert {int(image.counts.max()) for image in saturated.images} == {255}
-    assert (
-        select(inputs.descent_without_altitudes(), AltitudeMeasurement)
-        == select(inputs.descent_without_images(), DetectorImage)
-        == []
-    )
-    jittered, tags = inputs.descent_with_jitter(), [image.time_s for image in images]
-    assert [image.time_s for image in select(jittered, DetectorImage)] != tags
-    boundaries = np.concatenate([increments.times_s[1:] for increments in select(jittered, ImuIncrements)])
-    assert np.diff(boundaries).min() == 0.0

@@ -11,7 +11,7 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.store import CasesFile, load_images, write_camera
-from marsyard.sim.camera import BODY_FRAME, Cahvor, CameraModel, read_cahvor, read_pds3, write_cahvor
+from marsyard.sim.camera import BODY_FRAME, Cahvor, CameraModel, read_cahvor, read_camera, write_cahvor
 from marsyard.sim.frames import SITE_FROM_WORLD, world_from_mars_fixed
 from tests.sim.camera.labels import SITE_FROM_ROVER, pds3_label
 
@@ -149,7 +149,7 @@ def test_separate_camera_file_is_in_the_rover_frame(tmp_path: Path, small_camera
     folder.mkdir()
     product = pds3_label(folder, small_camera.transform(SITE_FROM_ROVER), "SITE_FRAME", name="0.img")
     pds3_label(folder, small_camera, "ROVER_FRAME", name="1.img", clock=101.0)
-    write_cahvor(read_pds3(product)[0], folder / "left.cahvor")
+    write_cahvor(read_camera(product), folder / "left.cahvor")
     write_folder(folder, ["case,file,camera", "a,0.img,left.cahvor", "a,1.img,"])
     first, second = ingest_cameras(folder, tmp_path / "out")
     assert_poses_agree(first, second)

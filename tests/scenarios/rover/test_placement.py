@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from marsyard.algorithms.vtt.placement import Placement, PlacementOutcome, measure_surface
+from marsyard.algorithms.vtt.arm import Placement, PlacementOutcome, measure_surface
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.rover.closed_loop import prepare_run, track_target
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters

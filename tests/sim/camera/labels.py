@@ -1,8 +1,9 @@
-"""Labels with a camera model in a given frame, in the formats of PDS3 and PDS4, for tests."""
+"""Helpers of the tests of camera files: labels with a model in a given frame, faults, comparison with OpenCV."""
 
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -66,6 +67,14 @@ GROUP = GEOMETRIC_CAMERA_MODEL
   REFERENCE_COORD_SYSTEM_NAME = "MCMF_FRAME"
 END_GROUP = GEOMETRIC_CAMERA_MODEL
 END"""
+
+#: EuRoC's first camera (sensor.yaml), with the fields that are read.
+EUROC = """resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
 
 
 def pds3_label(
@@ -174,3 +183,22 @@ def assert_fault(
         read(path)
     assert path.name in str(error_info.value)
     assert "allowed" in str(error_info.value)
+
+
+def compute_max_opencv_distance_px(
+    camera: CameraModel,
+    matrix: np.ndarray,
+    distortion: list[float] | np.ndarray,
+    pose: RigidTransform | None = None,
+    *,
+    fisheye: bool = False,
+) -> float:
+    """Compute the maximum distance over the frame between the pixels of Marsyard and OpenCV for the same far points."""
+    columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    points = camera.c + 1e5 * camera.rays(pixels)[1]
+    pose = RigidTransform.identity() if pose is None else pose
+    rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    expected_px, _ = project(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
+    return float(np.max(np.linalg.norm(expected_px.reshape(-1, 2) - pixels, axis=1)))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras, read_pds4
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras
 from tests.sim.camera.labels import assert_fault
 
 #: From NLF_0629_0722782785_631ECM_N0301344NCAM00427_06_095J01 (NASA PDS, mars2020_navcam_ops_raw): the camera model,
@@ -155,4 +155,4 @@ FAULTS = [
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
 def test_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert_fault(tmp_path / "label.xml", FULL_FRAME, (old, new), fault, read_pds4)
+    assert_fault(tmp_path / "label.xml", FULL_FRAME, (old, new), fault)

@@ -86,16 +86,10 @@ def test_projection_inverts_rays_of_random_cameras(camera: CameraModel, uv: np.n
     has_ray = np.isfinite(directions).all(axis=-1)
     reprojected, visible = camera.project(origins + distance_m * directions)
     assert np.array_equal(visible, has_ray)
+    assert np.allclose(np.linalg.norm(directions[has_ray], axis=-1), 1, rtol=0, atol=4e-15)
     # C is up to 5000 m away: a point at 0.5 m is rounded by 1e-12 m, or 1e-7 px for 4e4 px/rad (2048 px in 0.05 rad).
     # Near the end of the polynomial's range the inverse direction loses digits, but the pixel does not.
     assert np.max(np.abs(reprojected - pixels)[has_ray], initial=0) < 1e-6
-
-
-@given(cameras, fractions)
-def test_directions_are_unit_vectors(camera: CameraModel, uv: np.ndarray) -> None:
-    directions = camera.rays(pixels_from_fractions(camera, uv))[1]
-    observed = directions[np.isfinite(directions).all(axis=-1)]
-    assert np.allclose(np.linalg.norm(observed, axis=-1), 1, rtol=0, atol=1e-15 * 4)
 
 
 def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
@@ -163,41 +157,14 @@ def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float
     return beta / alpha, gamma / alpha
 
 
-def project_with_cmod(camera: Cahvor | Cahvore, point: np.ndarray) -> tuple[float, float]:
-    return (
-        project_with_cmod_cahvor(camera, point)
-        if isinstance(camera, Cahvor)
-        else project_with_cmod_cahvore(camera, point)
-    )
-
-
 @given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
 def test_projection_matches_cmod(camera: Cahvor | Cahvore, uv: np.ndarray, distance_m: float) -> None:
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
     points = (origins + distance_m * directions)[np.isfinite(directions).all(axis=-1)]
-    expected = np.array([project_with_cmod(camera, point) for point in points]).reshape(-1, 2)
+    project = project_with_cmod_cahvor if isinstance(camera, Cahvor) else project_with_cmod_cahvore
+    expected = np.array([project(camera, point) for point in points]).reshape(-1, 2)  # type: ignore[arg-type]
     # The bound is the rounding of points 5000 m away.
     assert np.max(np.abs(camera.project(points)[0] - expected), initial=0) < 1e-6
-
-
-def test_projection_of_real_cameras_matches_cmod(navcam: Cahvor, hazcam: Cahvore) -> None:
-    cameras: tuple[Cahvor | Cahvore, ...] = (navcam, hazcam)
-    for camera in cameras:
-        origins, directions = camera.rays(camera.pixel_grid()[::93, ::93].reshape(-1, 2))
-        points = origins + 5 * directions
-        expected = np.array([project_with_cmod(camera, point) for point in points])
-        # cmod uses O as labelled, whose length has an error of 1e-6. This causes an error of 2e-6 omega in lambda:
-        # 1e-4 px for f = 1223 px and mu up to 0.03.
-        assert np.max(np.abs(camera.project(points)[0] - expected)) < 2e-4
-
-
-def test_pinhole_rays_match_the_cahv_equations(pinhole: Cahv) -> None:
-    """The ray of the image centre is A; one column to the right adds 1 / hs to the tangent of the angle."""
-    hc, vc = pinhole.image_centre
-    hs, _ = pinhole.focal_lengths
-    centre_ray, next_column_ray = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
-    assert np.allclose(centre_ray, pinhole.a, atol=1e-6)  # A is labelled to six digits
-    assert math.isclose(math.atan(1 / hs), math.acos(centre_ray @ next_column_ray), rel_tol=1e-5)
 
 
 # ----- limits -----
@@ -217,27 +184,10 @@ def test_projection_centre_and_nan_are_not_visible(camera: CameraModel) -> None:
     assert not camera.project(points)[1].any()
 
 
-def make_folding_camera() -> Cahvor:
-    """Return a camera with the distortion chi - 0.2 chi^3, where chi is the tangent of the angle to the axis.
-
-    It increases up to chi^2 = 1 / 0.6, with the value (2 / 3) sqrt(1 / 0.6).
-    """
-    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
-    return Cahvor.from_cahv(cahv, r=(0.0, -0.2, 0.0))
-
-
-def test_distortion_does_not_fold_back() -> None:
-    camera = make_folding_camera()
-    limit = math.sqrt(1 / 0.6)
-    radii = np.array([0.0, 0.5 * limit, 0.999 * limit, 1.001 * limit, 2 * limit])
-    points = np.stack([radii, 0 * radii, 1 + 0 * radii], axis=-1)
-    pixels, visible = camera.project(points)
-    assert visible.tolist() == [True, True, True, False, False]
-    assert (np.diff(pixels[:3, 0]) > 0).all()
-
-
 def test_pixels_beyond_distortion_range_have_no_ray() -> None:
-    camera = make_folding_camera()
+    """The distortion chi - 0.2 chi^3 has its maximum, (2 / 3) sqrt(1 / 0.6), at chi^2 = 1 / 0.6."""
+    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
+    camera = Cahvor.from_cahv(cahv, r=(0.0, -0.2, 0.0))
     hc, vc = camera.image_centre
     max_radius_px = 100 * 2 / 3 * math.sqrt(1 / 0.6)
     directions = camera.rays(np.array([[hc + 0.9999 * max_radius_px, vc], [hc + 1.0001 * max_radius_px, vc]]))[1]
@@ -280,15 +230,6 @@ def test_fisheye_covers_more_than_ninety_degrees(hazcam: Cahvore) -> None:
     assert np.allclose(pixels[:, 0], 200 + 100 * angle)
 
 
-def test_cahvore_with_linearity_one_equals_cahvor(navcam: Cahvor) -> None:
-    cahvore = Cahvore(
-        navcam.c, navcam.a, navcam.h, navcam.v, navcam.o, navcam.r, np.zeros(3), linearity=1, size=navcam.size
-    )
-    points = navcam.c + 7 * navcam.rays(navcam.pixel_grid()[::50, ::50])[1]
-    assert np.allclose(cahvore.project(points)[0], navcam.project(points)[0], rtol=0, atol=1e-9)
-    assert np.allclose(cahvore.projection_jacobian(points), navcam.projection_jacobian(points), rtol=0, atol=1e-9)
-
-
 # ----- the Jacobian -----
 
 
@@ -300,16 +241,6 @@ def compute_numerical_jacobian(camera: CameraModel, points: np.ndarray, step: fl
         plus_two, minus_two = (camera.project(points + sign * 2 * step * axis)[0] for sign in (1, -1))
         columns.append((8 * (plus - minus) - (plus_two - minus_two)) / (12 * step))
     return np.stack(columns, axis=-1)
-
-
-def test_jacobian_of_real_cameras_matches_finite_differences(camera: CameraModel) -> None:
-    origins, directions = camera.rays(camera.pixel_grid()[::60, ::60])
-    points = origins + 3 * directions
-    analytic = camera.projection_jacobian(points)
-    # Fourth-order differences with 1 mm at 3 m, slopes of 400 px/m: relative truncation (3e-4)^4, rounding of
-    # 1e-12 px / 1e-3 m = 1e-9 px/m.
-    assert analytic.shape == (*points.shape[:-1], 2, 3)
-    assert np.max(np.abs(analytic - compute_numerical_jacobian(camera, points, 1e-3))) < 1e-7
 
 
 def test_jacobian_on_the_optical_axis_matches_finite_differences(navcam: Cahvor, hazcam: Cahvore) -> None:

@@ -62,7 +62,7 @@ def _fly_landing(
     errors = np.zeros((len(flight.path.rows), 9))
     errors[:, 0] = east_error_m
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
-    ground = GroundPatch(SITE_XY - 25.0, 0.5, heights)
+    ground = GroundPatch(float(SITE_XY[0]) - 25.0, float(SITE_XY[1]) - 25.0, 0.5, heights)
     laser = AltimeterErrors(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
     return simulate_landing(flight, GUIDANCE, SITE_XY, errors, air, ground, laser)
 

@@ -10,8 +10,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from marsyard.sim.dynamics.kernels.swing import Chain, compute_aerodynamic_force, compute_derivatives
-from marsyard.sim.dynamics.kernels.wind import WindField
+from marsyard.sim.dynamics.kernels.swing import Chain, WindField, compute_aerodynamic_force, compute_derivatives
 from marsyard.sim.dynamics.pendulum import Modes, SwingParameters, build_chain
 from marsyard.sim.dynamics.swing import SwingDescent
 
@@ -141,16 +140,6 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     assert rates[15:18] @ e == pytest.approx(-de @ de, abs=1e-12)
 
 
-def test_drag_and_friction_only_dissipate_energy() -> None:
-    parameters = SwingParameters(**LARGE_MOTION)
-    chain = build_chain(parameters, Modes.from_parameters(parameters, GRAVITY), GRAVITY, 2000.0)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        y = _draw_state(rng)
-        force = compute_aerodynamic_force(y, chain, _make_calm_wind())
-        assert force @ y[3:6] < 0.0
-
-
 def _build_linear_chain(parameters: SwingParameters) -> tuple[Chain, Modes]:
     """Build a chain that falls at a constant rate, because the air density is constant."""
     constant_density = parameters.model_copy(update={"density_scale_height_m": 1e15})
@@ -254,17 +243,6 @@ def test_motion_is_continuous_at_the_first_image() -> None:
     motion = descent.motion(np.array([-1e-9, 0.0]))
     np.testing.assert_allclose(motion.velocities_m_s[0], motion.velocities_m_s[1], atol=1e-6)
     np.testing.assert_allclose(motion.specific_forces_m_s2[0], motion.specific_forces_m_s2[1], atol=1e-6)
-
-
-def test_state_equals_a_row_of_motion() -> None:
-    descent = _fly(**LARGE_MOTION)
-    times = np.array([9.0, -3.0, 4.0])
-    motion = descent.motion(times)
-    for k, time in enumerate(times):
-        state = descent.state(float(time))
-        np.testing.assert_array_equal(state.position_m, motion.positions_m[k])
-        np.testing.assert_array_equal(state.specific_force_m_s2, motion.specific_forces_m_s2[k])
-        np.testing.assert_allclose(state.attitude.as_quat(), motion.attitudes[k].as_quat(), atol=1e-15)
 
 
 def test_fall_follows_terminal_velocity() -> None:
@@ -403,22 +381,3 @@ def test_error_messages_contain_the_allowed_values() -> None:
         _fly(1, START, 60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
-
-
-def test_compiled_integrator_matches_scipy() -> None:
-    """The results of the compiled integrator and of SciPy's DOP853 differ by at most 1e-8."""
-    descent = _fly(**LARGE_MOTION)
-    state = descent.path.at(np.zeros(1))[0]
-    for end_s in (-9.0, 12.0):
-        expected = solve_ivp(
-            lambda _t, y: compute_derivatives(y, descent.chain, descent.wind.field),
-            (0.0, end_s),
-            state,
-            method="DOP853",
-            dense_output=True,
-            rtol=1e-9,
-            atol=1e-9,
-        )
-        times = np.linspace(0.0, end_s, 200)
-        assert expected.sol is not None
-        np.testing.assert_allclose(descent.path.at(times), expected.sol(times).T, rtol=0.0, atol=1e-8)

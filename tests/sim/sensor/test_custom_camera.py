@@ -9,16 +9,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from marsyard.sim.camera import Cahvor, mount_looking_down, read_camera
 from marsyard.sim.sensor import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
+from tests.sim.camera.labels import EUROC
 
 CHOICE: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
 NAMED_OR_CUSTOM: TypeAdapter[str | CustomCamera] = TypeAdapter(NamedOrCustomCamera)
-#: EuRoC's first camera (sensor.yaml), with the fields that are read.
-EUROC = """resolution: [752, 480]
-camera_model: pinhole
-intrinsics: [458.654, 457.296, 367.215, 248.375]
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-"""
 
 
 @pytest.fixture

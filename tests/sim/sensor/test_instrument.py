@@ -24,11 +24,6 @@ def test_clock_offset_is_common_and_jitter_is_independent() -> None:
     assert np.std(jitters) == pytest.approx(0.003, rel=0.11)
 
 
-def test_error_free_tags_are_exact() -> None:
-    rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(Clock.draw(ClockParameters(), rng).tags(np.array([1.5, 2.5]), rng), [1.5, 2.5])
-
-
 def test_process_is_stationary_from_the_start() -> None:
     rng = np.random.default_rng(0)
     process = GaussMarkov.draw(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.sensor.mast import MASTS, MER_MAST, Mast, MastState, PointingParameters, stereo_mast
-from marsyard.sim.sensor.stereo_head import StereoCalibrationParameters, StereoHead
+from marsyard.sim.sensor.mast import (
+    MASTS,
+    MER_MAST,
+    Mast,
+    MastState,
+    PointingParameters,
+    StereoCalibrationParameters,
+    StereoHead,
+    stereo_mast,
+)
 
 EXACT_POINTING = PointingParameters(zero_deg=0.0, backlash_deg=0.0, settling_deg=0.0, count_deg=0.0)
 EXACT_CALIBRATION = StereoCalibrationParameters(

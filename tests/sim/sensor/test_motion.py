@@ -15,7 +15,6 @@ from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.image_motion import moving_exposure
-from marsyard.sim.sensor.kernels.exposure import write_path_kernel
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from tests.sim.scenes import DOWN, FORWARD, descent_camera
 from tests.sim.sensor.motions import uniform_motion
@@ -165,16 +164,6 @@ def test_image_at_infinite_range_moves_only_by_rotation() -> None:
     rotation_only = ImageMotion.from_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
     # A left turn moves the image to the right by 500 px/rad.
     assert rotation_only.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
-
-
-def test_path_kernel_has_unit_sum_and_zero_mean() -> None:
-    kernel = np.empty((15, 15))
-    offsets = np.arange(-7, 8)
-    for path in ((0.0, 0.0), (3.3, -7.1), (0.0, 9.0)):
-        write_path_kernel(*path, 7, kernel)
-        assert kernel.sum() == pytest.approx(1.0)
-        assert (kernel.sum(axis=1) * offsets).sum() == pytest.approx(0.0, abs=1e-12)
-        assert (kernel.sum(axis=0) * offsets).sum() == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("velocity", [(1222.0, 0.0), (0.0, -1222.0), (864.0, 864.0)])

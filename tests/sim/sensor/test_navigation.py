@@ -1,6 +1,8 @@
 """Tests of the navigation filter: errors consistent with its covariance, and robust to instrument faults."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -16,12 +18,17 @@ from marsyard.sim.dynamics.rotorcraft import (
     TransitParameters,
     simulate_transit,
 )
-from marsyard.sim.sensor.helicopter_navigation import FilterParameters, NavigationFilter, NavigationSolution
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor.gps import Outage, RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.helicopter_navigation import (
+    FilterParameters,
+    FilterState,
+    NavigationFilter,
+    NavigationSolution,
+)
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
-from marsyard.sim.sensor.kernels.navigation import POSITION_FIX, VELOCITY_FIX
-from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
-from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
+from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 
 #: Gravity, m/s2; number of simulated flights.
 GRAVITY, N_FLIGHTS = 9.8, 50
@@ -37,35 +44,55 @@ def _make_path(seed: int) -> SimulatedPath:
     return simulate_transit(CRAFT, TRANSIT, waypoint_m, 0.3, heading_rad, GRAVITY, air, rng).path
 
 
-def _run_filter(
-    seed: int,
-    imu_parameters: ImuParameters = SMALL_UNIT,
-    rtk_parameters: RtkParameters = RTK,
-    compass_parameters: TiltCompassParameters = COMPASS,
-    covariance_times_s: tuple[float, ...] = (),
-    parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
-) -> tuple[SimulatedPath, Imu, NavigationSolution]:
-    path, rng = _make_path(seed), np.random.default_rng([seed, 1])
-    span = path.span_s
-    imu = Imu.draw(imu_parameters, span, rng)
-    receiver, compass = RtkReceiver.draw(rtk_parameters, span, rng), TiltCompass.draw(compass_parameters, rng)
-    increments = imu.increments(path, *span, rng)
-    solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
-    readings = compass.measure(path, compass.sampling.within(*span), rng)
-    navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_parameters, compass_parameters, GRAVITY)
-    start = navigation.initialize(solutions, readings)
-    return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
+@dataclass(frozen=True)
+class Flight:
+    """A flight with its inertial unit, a filter, its initial state, and the readings of all instruments."""
+
+    path: SimulatedPath
+    imu: Imu
+    navigation: NavigationFilter
+    start: FilterState
+    increments: ImuIncrements
+    solutions: RtkSolutions
+    readings: TiltCompassReadings
+
+    @classmethod
+    def simulate(
+        cls,
+        seed: int,
+        imu_parameters: ImuParameters = SMALL_UNIT,
+        rtk: RtkParameters = RTK,
+        compass_parameters: TiltCompassParameters = COMPASS,
+    ) -> Flight:
+        path, rng = _make_path(seed), np.random.default_rng([seed, 1])
+        span = path.span_s
+        imu = Imu.draw(imu_parameters, span, rng)
+        receiver, compass = RtkReceiver.draw(rtk, span, rng), TiltCompass.draw(compass_parameters, rng)
+        increments = imu.increments(path, *span, rng)
+        solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
+        readings = compass.measure(path, compass.sampling.within(*span), rng)
+        navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, rtk, compass_parameters, GRAVITY)
+        start = navigation.initialize(solutions, readings)
+        return cls(path, imu, navigation, start, increments, solutions, readings)
+
+    def estimate(self, end_s: float = np.inf) -> NavigationSolution:
+        """Run the filter to a time tag."""
+        i = self.increments
+        count = int(np.searchsorted(i.times_s, end_s, side="right"))
+        part = ImuIncrements(
+            i.times_s[:count], i.period_s, i.delta_angles_rad[: count - 1], i.delta_velocities_m_s[: count - 1]
+        )
+        return self.navigation.run(self.start, part, self.solutions, self.readings)
 
 
-def _compute_errors(path: SimulatedPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
+def _compute_errors(flight: Flight, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
     """Compute the true minus the estimated state: position, velocity, attitude, biases of gyro and accelerometer.
 
-    The result has fifteen columns. `indices` select the samples of the inertial unit.
-
-    Scale and misalignment errors of the accelerometer count as a bias: their product with gravity.
+    The result has fifteen columns. `indices` select the samples of the inertial unit. Scale and misalignment errors of
+    the accelerometer count as a bias: their product with gravity.
     """
-    times = imu.boundaries(*path.span_s)[indices]
-    truth = path.motion(times)
+    imu, times = flight.imu, flight.imu.boundaries(*flight.path.span_s)[indices]
+    truth = flight.path.motion(times)
     gravity_scale_error = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
     return np.concatenate(
         [
@@ -79,41 +106,33 @@ def _compute_errors(path: SimulatedPath, imu: Imu, solution: NavigationSolution,
     )
 
 
-def test_errors_are_consistent_with_the_covariance() -> None:
-    """The mean normalised squared error over independent flights is within the 99.8 % band of chi-square.
+def _compute_end_error(flight: Flight, end_s: float, size: int) -> tuple[np.ndarray, float]:
+    """Run to a time; return the errors there, and the normalised squared error of the first `size` of them."""
+    solution = flight.estimate(end_s)
+    error = _compute_errors(flight, solution, np.array([len(solution.positions_m) - 1]))[0]
+    return error, float(error[:size] @ np.linalg.solve(solution.end.covariance[:size, :size], error[:size]))
 
-    The state of each flight has fifteen degrees of freedom.
-    """
+
+def _assert_chi_square(mean: float, degrees: int) -> None:
+    """Assert that a mean over `N_FLIGHTS` squared errors is within the 99.8 % band of chi-square."""
+    low, high = (float(chi2.ppf(probability, degrees * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
+    assert low < mean < high
+
+
+@pytest.mark.parametrize("end_s", [-3.0, 0.0, 2.5, 5.0])
+def test_errors_are_consistent_with_the_covariance(end_s: float) -> None:
+    """The state of each flight has fifteen degrees of freedom."""
     with_float_solutions = RtkParameters(float_fraction=0.3, float_s=10.0)
-    squared_errors = []
-    for seed in range(N_FLIGHTS):
-        times_s = (-3.0, 0.0, 2.5, 5.0)
-        path, imu, solution = _run_filter(seed, rtk_parameters=with_float_solutions, covariance_times_s=times_s)
-        errors = _compute_errors(path, imu, solution, solution.covariance_indices)
-        pairs = zip(errors, solution.covariances, strict=True)
-        squared_errors.append([float(error @ np.linalg.solve(covariance, error)) for error, covariance in pairs])
-    low, high = (float(chi2.ppf(probability, 15 * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
-    means = np.mean(squared_errors, axis=0)
-    assert np.all((means > low) & (means < high)), means
+    flights = (Flight.simulate(seed, rtk=with_float_solutions) for seed in range(N_FLIGHTS))
+    _assert_chi_square(float(np.mean([_compute_end_error(flight, end_s, 15)[1] for flight in flights])), 15)
 
 
-def test_innovations_are_white() -> None:
-    normalised_innovations: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
-    products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
-    for seed in range(20):
-        innovations = _run_filter(seed)[2].innovations
-        assert np.mean(innovations.used) > 0.99
-        for kind in normalised_innovations:
-            for axis in range(3):
-                is_selected = (innovations.kinds == kind) & (innovations.axes == axis) & (innovations.times_s > -8.0)
-                values = innovations.normalised[is_selected]
-                normalised_innovations[kind].extend(values)
-                products[kind].extend(values[1:] * values[:-1])
-    for kind in normalised_innovations:
-        # The standard errors from 7,600 values are 1.6 % of the variance and 0.011 of the correlation. A bias that the
-        # filter does not model increases both.
-        assert np.var(normalised_innovations[kind]) == pytest.approx(1.0, abs=0.1)
-        assert abs(np.mean(products[kind])) < 0.12
+def test_readings_without_faults_pass_the_gate() -> None:
+    for seed in range(10):
+        flight = Flight.simulate(seed)
+        open_gate = replace(flight.navigation, parameters=FilterParameters(gate=1e9))
+        without_gate = replace(flight, navigation=open_gate).estimate()
+        np.testing.assert_array_equal(flight.estimate().positions_m, without_gate.positions_m)
 
 
 def test_better_instruments_reduce_the_errors() -> None:
@@ -124,9 +143,9 @@ def test_better_instruments_reduce_the_errors() -> None:
     static = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
     white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": ClockParameters()}
     accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
-    path, imu, solution = _run_filter(0, ideal, accurate_receiver)
+    flight = Flight.simulate(0, ideal, accurate_receiver)
     # Ten seconds after the start; the unit has 100 samples per second.
-    errors = _compute_errors(path, imu, solution, np.arange(1000, 1550))
+    errors = _compute_errors(flight, flight.estimate(), np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
 
@@ -137,59 +156,45 @@ def test_outage_errors_are_consistent_with_the_covariance() -> None:
     The normalised squared error of position, velocity and attitude has nine degrees of freedom.
     """
     with_outage = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
-    squared_errors, horizontal_errors_m = [], []
-    for seed in range(N_FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
-        error = _compute_errors(path, imu, solution, solution.covariance_indices)[0]
-        squared_errors.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
-        horizontal_errors_m.append(np.hypot(*error[:2]))
-    assert 0.2 < np.sqrt(np.mean(np.square(horizontal_errors_m))) < 3.0
+    ends = [_compute_end_error(Flight.simulate(seed, rtk=with_outage), 5.0, 9) for seed in range(N_FLIGHTS)]
+    assert 0.2 < np.sqrt(np.mean([error[0] ** 2 + error[1] ** 2 for error, _ in ends])) < 3.0
     # The errors agree with the covariance during the outage.
-    low, high = (float(chi2.ppf(probability, 9 * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
-    assert low < np.mean(squared_errors) < high
+    _assert_chi_square(float(np.mean([squared for _, squared in ends])), 9)
 
 
 def test_stuck_instruments_are_ignored() -> None:
-    stuck_parameters = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
-    attitude_errors_deg: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
-    for seed in range(20):
-        for name, compass_parameters in (("free", COMPASS), ("stuck", stuck_parameters)):
-            path, imu, solution = _run_filter(seed, compass_parameters=compass_parameters)
-            error = _compute_errors(path, imu, solution, np.array([1500]))[0]
-            attitude_errors_deg[name].append(np.degrees(error[6:9]))
-            if name == "stuck":
-                late_kinds = solution.innovations.kinds[solution.innovations.times_s > -7.0]
-                assert set(late_kinds) == {POSITION_FIX, VELOCITY_FIX}
-    rms_free, rms_stuck = (np.sqrt(np.mean(np.square(attitude_errors_deg[name]), axis=0)) for name in ("free", "stuck"))
-    # The receiver's velocities determine the tilt with or without inclinometers.
-    assert np.all(rms_stuck[:2] < 1.5 * rms_free[:2] + 0.05)
-    assert rms_stuck[2] < 4.0
+    """The ninth of equal readings and all later ones have no effect: by default at most eight are used."""
+    flight = Flight.simulate(0, compass_parameters=TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0))
+    solution = flight.estimate()
+    up, headings = flight.readings.up_body.copy(), flight.readings.headings_rad.copy()
+    for values in (up, headings[:, None]):
+        last_change = int(np.flatnonzero(np.any(values[1:] != values[:-1], axis=1))[-1])
+        values[last_change + 1 + 8 :] = np.nan
+    without_readings = replace(flight, readings=replace(flight.readings, up_body=up, headings_rad=headings)).estimate()
+    np.testing.assert_array_equal(solution.attitudes.as_quat(), without_readings.attitudes.as_quat())
+    # The receiver's velocities determine the tilt also without inclinometers.
+    error_deg = np.degrees(_compute_errors(flight, solution, np.array([1500]))[0, 6:9])
+    assert np.abs(error_deg[:2]).max() < 1.0
+    assert abs(error_deg[2]) < 8.0
 
 
 def test_filter_resets_after_persistent_rejection() -> None:
     """A filter with an initial error of 20 m rejects all fixes and resets after one second."""
-    path, rng = _make_path(3), np.random.default_rng(4)
-    span = path.span_s
-    imu, receiver = Imu.draw(SMALL_UNIT, span, rng), RtkReceiver.draw(RtkParameters(float_fraction=0.0), span, rng)
-    compass = TiltCompass.draw(COMPASS, rng)
-    solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
-    readings = compass.measure(path, compass.sampling.within(*span), rng)
-    navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)
-    start = navigation.initialize(solutions, readings)
+    flight = Flight.simulate(3, rtk=RtkParameters(float_fraction=0.0))
+    start = flight.start
     wrong_start = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
-    solution = navigation.run(wrong_start, imu.increments(path, *span, rng), solutions, readings)
-    innovations = solution.innovations
-    assert not innovations.used[(innovations.kinds == POSITION_FIX) & (innovations.axes == 0)][0]
-    position_errors_m = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
+    solution = replace(flight, start=wrong_start).estimate()
+    errors_m = np.abs(_compute_errors(flight, solution, np.arange(len(solution.positions_m)))[:, :3])
     # Errors after 0.8 s, and from 2 s on.
-    assert position_errors_m[80, 0] > 15.0
-    assert position_errors_m[200:].max() < 0.1
+    assert errors_m[80, 0] > 15.0
+    assert errors_m[200:].max() < 0.1
 
 
 def test_pose_is_defined_only_within_the_flight() -> None:
-    path, _, solution = _run_filter(0)
+    flight = Flight.simulate(0)
+    solution = flight.estimate()
     with pytest.raises(ValueError, match="outside the solution times"):
-        solution.pose(path.span_s[1] + 1.0)
+        solution.pose(flight.path.span_s[1] + 1.0)
     # 5 ms after a boundary the position has moved by 5 ms of its velocity.
     tags = solution.increments.times_s
     displacement_m = solution.pose(tags[700] + 0.005).translation - solution.positions_m[700]

@@ -25,13 +25,6 @@ def test_point_spread_preserves_total_light_and_position(parameters: OpticsParam
     assert (image * columns).sum() / image.sum() == pytest.approx(17.0, abs=1e-3)
 
 
-def test_total_light_is_conserved_at_the_border() -> None:
-    scene = np.random.default_rng(0).random((30, 25), dtype=np.float32)
-    assert apply_point_spread(scene, OPTICS).sum(dtype=np.float64) == pytest.approx(
-        scene.sum(dtype=np.float64), rel=1e-6
-    )
-
-
 def test_point_spread_has_the_specified_modulation_transfer() -> None:
     """The modulation at half the Nyquist frequency has a closed form; the kernel includes light beyond its ends."""
     frequency = 0.25

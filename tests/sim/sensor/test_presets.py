@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from marsyard.sim.camera import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParameters, natural_fall_off, preset
 
 
@@ -80,10 +80,6 @@ def test_pancam_has_toe_in() -> None:
     assert disparity == pytest.approx(516.1 - 120.1, abs=1.0)
 
 
-def test_hazcam_is_a_fisheye() -> None:
-    assert all(isinstance(camera, Cahvore) for camera in preset("mer-hazcam").cameras())
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_each_preset_exposes_an_image(name: str) -> None:
     """Ground of radiance factor 0.3 fills about 60 % of full scale on axis; for the descent camera 5 to 10 %."""
@@ -112,11 +108,6 @@ def test_responsivity_is_proportional_to_the_sunlight(name: str) -> None:
     )
 
 
-def test_unknown_preset_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"unknown camera preset 'mer-pancam'; allowed: mer-descent-flown, "):
-        preset("mer-pancam")
-
-
 def test_campaign_can_modify_a_preset() -> None:
     detector = _Campaign.model_validate(
         {"detector": {"preset": "mer-descent-field", "temperature_c": 23.0, "optics": {"dust_discs": 3}}}
@@ -126,5 +117,5 @@ def test_campaign_can_modify_a_preset() -> None:
     assert detector.temperature_c == 23.0
     assert detector.optics == expected.optics.model_copy(update={"dust_discs": 3})
     assert _Campaign.model_validate({"detector": {"rows_summed": 2}}).detector.rows_summed == 2
-    with pytest.raises(ValidationError, match="unknown camera preset"):
+    with pytest.raises(ValidationError, match=r"unknown camera preset 'kodak'; allowed: mer-descent-flown, "):
         _Campaign.model_validate({"detector": {"preset": "kodak"}})

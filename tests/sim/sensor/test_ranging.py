@@ -14,12 +14,10 @@ from marsyard.sim.sensor import (
     LaserParameters,
     RadarAltimeter,
     RadarParameters,
-    Readings,
     Sampling,
     height_above_ground,
 )
-from marsyard.sim.sensor.radar import first_return
-from marsyard.sim.sensor.ranging import RangingUnit, range_along
+from marsyard.sim.sensor.altimeters import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
 from tests.sim.scenes import flat_ground, make_ground
 from tests.sim.sensor.motions import Swaying
@@ -96,15 +94,6 @@ def test_readings_are_measured_at_the_true_time(make: Callable[..., Instrument])
     assert error.std() == pytest.approx(0.001, rel=0.15)
 
 
-@with_each_instrument
-def test_equal_random_streams_produce_equal_readings(make: Callable[..., Instrument]) -> None:
-    def read() -> Readings:
-        return make(np.random.default_rng(5)).measure(DESCENT, np.array([0.0, 1.0]), np.random.default_rng(6))
-
-    np.testing.assert_array_equal(read().values, read().values)
-    np.testing.assert_array_equal(read().times_s, read().times_s)
-
-
 def test_readings_have_constant_rate_and_random_phase() -> None:
     sampling = Sampling(10.0, 0.03)
     np.testing.assert_allclose(sampling.within(0.0, 0.35), [0.03, 0.13, 0.23, 0.33])
@@ -127,11 +116,6 @@ def test_radar_scale_is_common_and_noise_is_independent() -> None:
     # The standard error of the deviation from 300 values is 4 %; the tolerance is three times that.
     assert np.std(common_errors) == pytest.approx(10.0, rel=0.12)
     assert np.std(noise_errors) == pytest.approx(1.0, rel=0.12)
-
-
-def test_default_radar_error_is_one_percent_at_3_sigma() -> None:
-    parameters = RadarParameters()
-    assert 3.0 * np.hypot(parameters.scale_error, parameters.noise) == pytest.approx(0.01, rel=0.01)
 
 
 def test_radar_is_quantised_and_limited_in_range() -> None:
