@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_cores, prepare_descent_exposure
@@ -24,9 +25,8 @@ from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.rays import VIEW_SIDE_PX
-from marsyard.sim.render.renderer import ground_mesh
-from marsyard.sim.render.scene import graded_offsets
+from marsyard.sim.render.mesh import graded_offsets, ground_mesh
+from marsyard.sim.render.pixel_rays import VIEW_SIDE_PX
 
 #: Side of all frames, pixels.
 SIDE_PX = 1024
@@ -71,9 +71,9 @@ def _make_descent_mesh() -> dict[str, Any]:
     """Return terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
     scene, surface = descent_scene()
     offsets = graded_offsets(scene.mesh_half_width_m, 3.0, 1025)  # 1025 lines per axis, 3 m apart in the centre
-    mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
+    vertices, faces = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
     return {
-        "mesh": mesh,
+        "mesh": trimesh.Trimesh(vertices, faces, process=False),
         "pose": descent_pose(surface).as_matrix(),
         "focal_px": float(camera_optics(DescentCameraParameters()).rays.focal_px[0]),
         "sun": np.asarray(SUN.direction),

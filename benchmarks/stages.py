@@ -14,10 +14,10 @@ DESCENT_STAGES: Stages = {
     "terrain and rocks": (("descent/world.py", "from_parameters"), ("descent/world.py", "scene")),
     "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
-    "ray intersection": (("render/renderer.py", "trace_pixels"),),
+    "ray intersection": (("render/arrays.py", "trace_primary_rays"),),
     "shadow of the ground": (("render/ground_shadow.py", "compute_ground_shadow"),),
     "shading": (("render/renderer.py", "shade_hits"),),
-    "rays in edge pixels": (("render/renderer.py", "trace_subpixels"),),
+    "rays in edge pixels": (("render/renderer.py", "supersample_rays"), ("render/arrays.py", "trace_subpixel_rays")),
     "detector": (
         ("sensor/detector.py", "draw"),
         ("sensor/detector.py", "expose"),

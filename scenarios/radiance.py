@@ -8,7 +8,7 @@ from jaxtyping import Float32
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Sun
-from marsyard.sim.render.reflectance import add_air_light
+from marsyard.sim.render.sky import add_air_light
 from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import Environment, Surface
 

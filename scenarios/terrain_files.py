@@ -19,8 +19,14 @@ from marsyard.scenarios.map_projection import NoInverseError, map_scale
 from marsyard.scenarios.missing_heights import find_missing_value
 from marsyard.sim.files import check_regular, read_npz_headers, report_damage
 from marsyard.sim.terrain import TerrainParameters, sites
-from marsyard.sim.terrain.geotiff import brightness_problems, read_heights
-from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, check_holes, read_rasters
+from marsyard.sim.terrain.rasters import (
+    RealTerrain,
+    TerrainFileError,
+    brightness_problems,
+    check_holes,
+    read_heights,
+    read_rasters,
+)
 
 #: Maximum number of DTM posts along a side (size of the largest terrain), and of orthoimage pixels (memory).
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192

@@ -21,10 +21,9 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Frame, Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend
-from marsyard.sim.render.texture import MicroRelief
+from marsyard.sim.render.texture import MicroRelief, octave_heights
 from marsyard.sim.sensor import CameraDesign, ImageMotion
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
-from marsyard.sim.terrain.microrelief import octave_heights
 from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS, find_periods
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
     from marsyard.sim.terrain.imported import EmbeddedDtm, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
-    from marsyard.sim.terrain.surface import TerrainStatistics
+    from marsyard.sim.terrain.statistics import TerrainStatistics
 
 #: Nadir image: maximum side length, pixels; colours (blue, green, red) of filled holes and of the outline of a DTM.
 MAX_SIDE_PX = 2048
@@ -72,10 +72,9 @@ def stats(
 
     from marsyard.scenarios.terrain_files import grid_north_deg
     from marsyard.scenarios.terrain_model_sites import MAX_HOLE_FRACTION, load_site
-    from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
-    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
-    from marsyard.sim.terrain.surface import terrain_statistics
+    from marsyard.sim.terrain.statistics import PUBLISHED_SITES, terrain_statistics
+    from marsyard.sim.terrain.synthesis import synthesise
 
     try:
         definition = load_site(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -119,7 +118,7 @@ def _write_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -> None:
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
+    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--image {path}: the file name must end in .png")
@@ -157,8 +156,7 @@ def _print_statistics(
 ) -> None:
     from rich.table import Table
 
-    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
-    from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG, PUBLISHED_SITES
 
     side_m, paper = parameters.samples * parameters.spacing_m, PUBLISHED_SITES.get(site)
     albedo, slope, relief, contrast = "", "", "", ""

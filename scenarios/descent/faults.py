@@ -14,7 +14,7 @@ from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
 from marsyard.sim.error_sources import CLOUDS, DETECTOR
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, bounded_field
-from marsyard.sim.render.photometry import CloudLayer, CloudParameters
+from marsyard.sim.render.clouds import CloudLayer, CloudParameters
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.landforms import Dunes

@@ -13,7 +13,7 @@ from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend, RenderingError
-from marsyard.sim.render.rays import VIEW_SIDES_PX
+from marsyard.sim.render.pixel_rays import VIEW_SIDES_PX
 from marsyard.sim.render.shading import GROUND
 from marsyard.sim.terrain import Surface
 

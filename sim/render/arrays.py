@@ -1,13 +1,16 @@
-"""Arrays of Dr.Jit: compiled functions over them, selections, and exchange with NumPy.
+"""Arrays of Dr.Jit: compiled functions over them, selections, exchange with NumPy, and periodic grids.
 
 A function over Dr.Jit arrays is traced once and compiled to one program, which then processes all pixels. The compiled
 programs are stored in the cache folder; their names are hashes of their instructions, so they are never outdated.
 Results do not depend on the number of threads, because each pixel is computed independently of the others.
 """
 
+from __future__ import annotations
+
 import gc
 from collections.abc import Callable
-from functools import wraps
+from dataclasses import dataclass
+from functools import update_wrapper
 from typing import Any
 
 import drjit as dr
@@ -30,7 +33,6 @@ def compiled(function: Callable[..., Values]) -> Any:
     """
     frozen = dr.freeze(function, auto_opaque=False, warn_after=1000)
 
-    @wraps(function)
     def call(*arguments: Values) -> Values:
         is_enabled = gc.isenabled()
         gc.disable()
@@ -40,8 +42,9 @@ def compiled(function: Callable[..., Values]) -> Any:
             if is_enabled:
                 gc.enable()
 
+    call.__code__ = call.__code__.replace(co_name=function.__name__)  # the name that profilers show
     call.frozen = frozen  # type: ignore[attr-defined]
-    return call
+    return update_wrapper(call, function)
 
 
 def larger(a: Values, b: Values) -> Values:
@@ -98,3 +101,36 @@ def to_host(values: Values) -> NDArray[Any]:
     if dr.depth_v(values) == 1:
         return np.asarray(values.numpy())
     return np.asarray(dr.ravel(values).numpy()).reshape(-1, len(values))
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicGrid:
+    """A periodic grid of numbers, whose side is a power of two; y increases with the row."""
+
+    values: Values
+    log2_side: Values
+    per_metre: Values
+
+    @classmethod
+    def of(cls, values: np.ndarray, per_metre: float, *, share: bool = False) -> PeriodicGrid:
+        """Copy a grid, shape (side, side), to the device."""
+        kind = UInt8 if values.dtype == np.uint8 else Float
+        side = len(values)
+        return cls(to_device(kind, values, share=share), UInt32(side.bit_length() - 1), Float64(per_metre))
+
+    def neighbours(self, x: Values, y: Values, active: Values) -> tuple[list[Values], Values, Values]:
+        """Return the values south-west, south-east, north-west, north-east of positions, and fractions of a cell."""
+        grid_x, grid_y = x * self.per_metre, y * self.per_metre
+        floor_x, floor_y = dr.floor(grid_x), dr.floor(grid_y)
+        column, row, last = Int32(floor_x), Int32(floor_y), Int32((UInt32(1) << self.log2_side) - 1)
+        columns = [UInt32((column + offset) & last) for offset in (0, 1)]
+        lines = [UInt32((row + offset) & last) << self.log2_side for offset in (0, 1)]
+        values = [dr.gather(type(self.values), self.values, line + j, active) for line in lines for j in columns]
+        return values, grid_x - floor_x, grid_y - floor_y
+
+    def interpolate(self, x: Values, y: Values, active: Values = True, kind: Any = Float) -> Values:
+        """Interpolate the grid bilinearly at positions, metres, with single or double precision."""
+        corners, fraction_x, fraction_y = self.neighbours(x, y, active)
+        south_west, south_east, north_west, north_east = map(kind, corners)
+        fx, fy = kind(fraction_x), kind(fraction_y)
+        return dr.lerp(dr.lerp(south_west, south_east, fx), dr.lerp(north_west, north_east, fx), fy)

@@ -8,6 +8,8 @@ around a camera in a scene with objects at a distance of kilometres. A ray is te
 cell of each body with a projection that contains the ray.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -28,6 +30,8 @@ from marsyard.sim.render.device import (
     Matrix3f64,
     UInt32,
 )
+from marsyard.sim.render.objects import Objects
+from marsyard.sim.render.sky import Sun
 from marsyard.sim.render.triangles import is_inside
 
 #: Minimum u, v and s, then maximum u, v and s, of items.
@@ -190,21 +194,21 @@ def list_in_grids(
     return replace(grids, starts=starts, items=items)
 
 
-def list_casters(
-    corners: Values, first_triangle: Int64[np.ndarray, "bodies+1"], axes: FloatArray[np.ndarray, "3 3"]
-) -> Casters:
-    """Project the triangles along the sun's direction and list them in grids.
-
-    - corners, first_triangle: corners, three for each triangle; body b consists of the triangles `first_triangle[b]` to
-      `first_triangle[b + 1] - 1`
-    - axes: rows are the unit vectors u, v and s; s points to the sun
-    """
-    matrix, counts = Matrix3f64(*axes.ravel().tolist()), np.diff(first_triangle)
+def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
+    """List the triangles that can cast shadows, in grids perpendicular to the sun's direction; None without any."""
+    if len(objects) == 0:
+        return None
+    direction = np.asarray(sun.direction, dtype=np.float64)
+    first_axis = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    first_axis /= np.linalg.norm(first_axis)
+    # rays are exactly parallel to the third axis
+    axes = np.stack([first_axis, np.cross(direction, first_axis), direction])
+    matrix, counts = Matrix3f64(*axes.ravel().tolist()), np.diff(objects.first_triangle)
     # products with zeros would change the zeros of a matrix of constants
     dr.make_opaque(matrix)
-    projected, low, high = _project(corners, matrix)
+    projected, low, high = _project(objects.corners, matrix)
     dr.eval(projected, low, high)
-    body_bounds = _enclose(np.concatenate([to_host(low), to_host(high)], axis=1), first_triangle[:-1])
+    body_bounds = _enclose(np.concatenate([to_host(low), to_host(high)], axis=1), objects.first_triangle[:-1])
     body = to_device(UInt32, np.repeat(np.arange(len(counts)), counts))
     triangle_sides = _choose_sides(counts / TRIANGLES_PER_CELL)
     bodies = list_in_grids(low.xy, high.xy, body, body_bounds, triangle_sides, dr.arange(UInt32, len(body)))

@@ -10,6 +10,7 @@ import drjit as dr
 
 from marsyard.sim.render.arrays import Values, larger, smaller
 from marsyard.sim.render.device import Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
@@ -26,14 +27,6 @@ CREST_ITERATIONS = 4
 #: Maximum number of iterations with the cubic (1.1 on average; false position alone takes 3.6), and in total. The
 #: remaining iterations use false position, which always converges.
 CUBIC_ITERATIONS, MAX_ITERATIONS = 3, 40
-
-
-@dataclass(eq=False)
-class Ray:
-    """Rays in world axes: origins, metres, and unit directions."""
-
-    origin: Values
-    direction: Values
 
 
 @dataclass(eq=False)

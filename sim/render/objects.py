@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from marsyard.sim.render.arrays import Values, vectors_to_device
 from marsyard.sim.render.cones import spheres_in_cone
 from marsyard.sim.render.device import Array3f64
-from marsyard.sim.render.triangles import Hierarchy, body_bounds, bounding_spheres, morton_codes
+from marsyard.sim.render.triangles import Hierarchy, morton_codes
 
 #: Identifiers of users' meshes start here; identifiers of rocks are smaller.
 FIRST_MESH_NUMBER = 2**30
@@ -114,16 +114,23 @@ class Objects:
     @cached_property
     def bounds(self) -> Float64[np.ndarray, "bodies 6"]:
         """Minimum x, y, z, then maximum x, y, z of each body."""
-        return body_bounds(self.triangles, self.first_triangle)
+        if len(self) == 0:
+            return np.empty((0, 6))
+        a, b, c = (self.triangles[:, corner] for corner in range(3))
+        extremes = [
+            choose.reduceat(choose(choose(a, b), c), self.first_triangle[:-1]) for choose in (np.minimum, np.maximum)
+        ]
+        return np.concatenate(extremes, axis=1)
 
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
         """Bounding sphere of each body, centred at the centre of its bounding box: centre and radius."""
-        return bounding_spheres(self.triangles, self.first_triangle, self.bounds)
-
-    def with_shelter(self, corners: Float64[np.ndarray, "8 3"]) -> Objects:
-        """Return the objects with a shelter."""
-        return replace(self, shelter=corners)
+        if len(self) == 0:
+            return np.empty((0, 4))
+        centres = 0.5 * (self.bounds[:, :3] + self.bounds[:, 3:])
+        centre_of_triangle = centres[self.body_of_triangle]
+        squares = np.max([np.square(self.triangles[:, k] - centre_of_triangle).sum(axis=1) for k in range(3)], axis=0)
+        return np.column_stack([centres, np.sqrt(np.maximum.reduceat(squares, self.first_triangle[:-1]))])
 
     @property
     def is_rock(self) -> Bool[np.ndarray, "bodies"]:

@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import pyrender
-import trimesh
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt32
 from OpenGL import GL, platform
 from pyrender.shader_program import ShaderProgramCache
 
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.views import depth_in_metres
 
 #: Rotation from OpenGL's camera axes (y up, looking along -z) to the view's axes (y down, z forward).
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -45,15 +43,15 @@ class DepthRenderer:
 
     def load(
         self,
-        ground: trimesh.Trimesh,
+        vertices: Float64[np.ndarray, "vertices 3"],
+        faces: UInt32[np.ndarray, "faces 3"],
         triangles: Float64[np.ndarray, "triangles 3 3"],
         numbers: Int64[np.ndarray, "triangles"],
     ) -> None:
-        """Load the ground and the numbered triangles of objects, in world coordinates; they replace previous data.
+        """Load the mesh of the ground and the numbered triangles of objects; they replace previous data.
 
-        Raises RenderingError if there are too many vertices.
+        Coordinates are those of the world, metres. Raises RenderingError if there are too many vertices.
         """
-        vertices, faces = ground.vertices.view(np.ndarray), ground.faces.view(np.ndarray)
         # the corners of the objects' triangles are the first vertices: triangle i has the vertices 3 i to 3 i + 2
         corners = triangles.reshape(-1, 3)
         count = len(corners)
@@ -104,6 +102,17 @@ class DepthRenderer:
     def close(self) -> None:
         """Delete the context and its buffers."""
         self._offscreen.delete()
+
+
+def depth_in_metres(depths: Float32[np.ndarray, "rows columns"], near: float, far: float) -> Float32[np.ndarray, "_ _"]:
+    """Convert OpenGL's depths to depth along the axis, metres, 0 where there is no surface; reverse the order of rows.
+
+    `depths` are 0 at `near`, and 1 at `far` and where there is no surface; their first row is the lowest. The result
+    has single precision.
+    """
+    depths = depths[::-1]
+    difference, total, product = np.float32(far - near), np.float32(far + near), np.float32(2.0 * near * far)
+    return np.where(depths == 1.0, np.float32(0.0), product / ((1.0 - 2.0 * depths) * difference + total))
 
 
 class _VertexRenderer(pyrender.Renderer):  # type: ignore[misc]

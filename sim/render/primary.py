@@ -16,8 +16,10 @@ from jaxtyping import Float32
 from jaxtyping import Int32 as IntArray
 
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, where
-from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
-from marsyard.sim.render.ground import MAX_CHANGE, Extent, Ray, refine, search_grazing_ray
+from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
+from marsyard.sim.render.ground import MAX_CHANGE, Extent, refine, search_grazing_ray
+from marsyard.sim.render.pixel_rays import PixelRays
+from marsyard.sim.render.rays import Pose, Ray, Rays
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.triangles import Hierarchy, TriangleHit, intersect, is_inside, nearest_hit, no_hit
 
@@ -29,38 +31,6 @@ MAX_FINE_FOOTPRINT = 8.0
 MAX_GRAZING_SINE = 0.4
 #: Tolerance of barycentric weights, so that no ray passes between two neighbouring triangles.
 SLACK = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Rotation matrix from body to world axes, and world position of the camera's centre of projection."""
-
-    rotation: Values
-    position: Values
-
-    @classmethod
-    def of(cls, rotation: np.ndarray, position: np.ndarray) -> Pose:
-        """Copy a rotation matrix and a position to the device."""
-        return cls(Matrix3f64(*rotation.ravel().tolist()), Array3f64(*position.tolist()))
-
-
-@dataclass(frozen=True, eq=False)
-class Rays:
-    """Rays in body axes: unit directions, origins relative to the camera's centre (None: all 0), pixel angles, rad."""
-
-    directions: Values
-    origins: Values | None
-    pixel_angles: Values
-
-    def in_world(self, pose: Pose) -> Ray:
-        """Transform the rays to world axes."""
-        offset = 0.0 if self.origins is None else pose.rotation @ Array3f64(self.origins)
-        return Ray(pose.position + offset, pose.rotation @ Array3f64(self.directions))
-
-    def select(self, index: Values) -> Rays:
-        """Return some of the rays."""
-        origins = None if self.origins is None else dr.gather(Array3f, self.origins, index)
-        return Rays(dr.gather(Array3f, self.directions, index), origins, dr.gather(Float, self.pixel_angles, index))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +54,16 @@ class Views:
 
     @classmethod
     def of(
-        cls,
-        depth: Float32[np.ndarray, "views side side"],
-        numbers: IntArray[np.ndarray, "views _ _"],
-        focal: np.ndarray,
-        view_from_body: np.ndarray,
-        view_of_pixel: Values,
+        cls, depth: Float32[np.ndarray, "views side side"], numbers: IntArray[np.ndarray, "views _ _"], rays: PixelRays
     ) -> Views:
-        """Copy views to the device."""
+        """Copy the views of a camera's rays to the device."""
         return cls(
             to_device(Float, depth),
             to_device(Int32, numbers) if numbers.size else None,
             UInt32(depth.shape[1]),
-            to_device(Float64, focal),
-            to_device(Float64, view_from_body),
-            view_of_pixel,
+            to_device(Float64, rays.focal_px),
+            to_device(Float64, rays.view_from_body),
+            rays.device_view_of_pixel,
         )
 
 

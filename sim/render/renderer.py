@@ -22,40 +22,28 @@ from weakref import ref
 
 import drjit as dr
 import numpy as np
-from jaxtyping import Float as FloatArray
 from jaxtyping import Float32, Int64
-from jaxtyping import Float64 as Float64Array
-from jaxtyping import Int as IntArray
-from jaxtyping import Int32 as Int32Array
-from scipy.spatial import ConvexHull
+from jaxtyping import Float64 as FloatArray
+from jaxtyping import Int32 as IntArray
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
-from marsyard.sim.render.arrays import to_device, to_host
+from marsyard.sim.render.arrays import Values, to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.device import UInt32, description
-from marsyard.sim.render.edges import mark_edges
-from marsyard.sim.render.ground import Extent
-from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
-from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Pose, Rays, Views, trace_primary_rays
-from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
+from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
+from marsyard.sim.render.mesh import visible_mesh
+from marsyard.sim.render.pixel_rays import VIEW_SIDE_PX, PixelRays
+from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Views, trace_primary_rays
+from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.shading import Light, ShadedImage, shade
-from marsyard.sim.render.shadows import Occluders, visible_sun
+from marsyard.sim.render.shadows import visible_sun
 from marsyard.sim.render.spline import Terrain
-from marsyard.sim.render.subpixels import split_rays, trace_subpixel_rays
-from marsyard.sim.render.triangles import Hierarchy
-from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.kernels import Level
 
 if TYPE_CHECKING:
-    import trimesh
-
     from marsyard.sim.render.pinhole import DepthRenderer
 
-#: Number of terrain levels (resolutions) in a kernel call: kernels are compiled for a fixed number of arrays. A terrain
-#: with 2**15 samples along a side has 12 levels.
-LEVELS = 12
 #: Options of glibc's mallopt (malloc.h).
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 #: Size from which memory is mapped separately: terrains are larger, images are smaller.
@@ -66,16 +54,6 @@ _TRIM_THRESHOLD_BYTES = 1 << 30
 _TRIM_INTERVAL_SCENES = 16
 #: Number of rays along each side of an image (probe rays) that determine the visible ground.
 _PROBES = 9
-
-
-def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
-    """Compute `side` x `side` rays in each of these pixels, with the pixel angle of the pixel."""
-    columns, rows = rays.size
-    pixel = to_device(UInt32, np.repeat(pixels, side**2))
-    ray_in_pixel = to_device(UInt32, np.tile(np.arange(side**2), len(pixels)))
-    return split_rays(rays.device, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
-
-
 #: Index of rows and columns of an image.
 PixelIndex = tuple[slice | Int64[np.ndarray, "n"], slice | Int64[np.ndarray, "n"]]
 
@@ -92,13 +70,13 @@ class Frame:
     """
 
     radiance: Float32[np.ndarray, "rows columns"]
-    range_m: Float64Array[np.ndarray, "rows columns"]
-    body: Int32Array[np.ndarray, "rows columns"]
+    range_m: FloatArray[np.ndarray, "rows columns"]
+    body: IntArray[np.ndarray, "rows columns"]
     normal: Float32[np.ndarray, "rows columns 3"]
     world_from_body: RigidTransform
     rays: PixelRays
 
-    def points_world(self, pixels: PixelIndex = np.s_[:, :]) -> Float64Array[np.ndarray, "*selected 3"]:
+    def points_world(self, pixels: PixelIndex = np.s_[:, :]) -> FloatArray[np.ndarray, "*selected 3"]:
         """Return the world points, metres, that the selected pixels see; NaN for the sky.
 
         `pixels` is an index of rows and columns: slices, or arrays of row and column numbers.
@@ -111,48 +89,6 @@ class Frame:
         finite_distance = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
         points_body = self.rays.centre + origins + finite_distance * directions.astype(np.float64)
         return np.asarray(self.world_from_body.apply(points_body)).reshape(*distance.shape, 3)
-
-
-@dataclass(frozen=True, eq=False)
-class _Tracer:
-    """A scene and a camera in its pose, on the device."""
-
-    scene: Scene
-    rays: PixelRays
-    terrain: Terrain
-    extent: Extent
-    pose: Pose
-    tree: Hierarchy | None
-    light: Light
-    occluders: Occluders
-
-    def trace_pixels(self, views: Views, is_grazing: bool) -> Hits:
-        """Trace the ray of each pixel."""
-        geometry = self.terrain, self.extent, views, self.pose, self.rays.device, self.tree
-        return trace_primary_rays(*geometry, is_grazing)
-
-    def shade_hits(self, rays: Rays, hits: Hits) -> ShadedImage:
-        """Compute radiance, body and normal at the hits of rays."""
-        light, materials, geometry = self.light, self.scene.materials, (self.terrain, self.pose, rays, hits)
-        sun_fraction = visible_sun(*geometry, light.sun, light.sun_radius, self.occluders, materials.objects)
-        return shade(*geometry, light, sun_fraction, materials)
-
-    def smooth_edges(self, image: ShadedImage, hits: Hits, radiance: Float32[np.ndarray, "pixels"]) -> None:
-        """Replace the radiance of pixels at edges by the mean of several rays."""
-        columns, rows = map(UInt32, self.rays.size)
-        pixels = np.flatnonzero(to_host(mark_edges(image, hits.distance, columns, rows)))
-        if len(pixels) > 0:
-            rays, subpixel_hits = self.trace_subpixels(pixels, hits)
-            subpixel_radiance = to_host(self.shade_hits(rays, subpixel_hits).radiance)
-            radiance[pixels] = subpixel_radiance.reshape(len(pixels), -1).mean(axis=1)
-
-    def trace_subpixels(self, pixels: Int64[np.ndarray, "pixels"], hits: Hits) -> tuple[Rays, Hits]:
-        """Trace several rays in each of these pixels."""
-        columns, rows = map(UInt32, self.rays.size)
-        side = self.scene.edge_rays
-        rays, pixel = supersample_rays(self.rays, pixels, side), to_device(UInt32, np.repeat(pixels, side**2))
-        geometry = self.terrain, self.extent, self.pose, self.tree
-        return rays, trace_subpixel_rays(*geometry, columns, rows, pixel, rays, hits)
 
 
 class Renderer:
@@ -190,23 +126,21 @@ class Renderer:
         # height bounds save time only for rays almost parallel to the ground
         terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
         tree, light = scene.objects.hierarchy(numbers, position), scene.light(time_s)
-        pose, occluders = Pose.of(rotation, position), scene.occluders
-        tracer = _Tracer(scene, rays, terrain, scene.extent, pose, tree, light, occluders)
-        hits = tracer.trace_pixels(views, is_grazing)
-        image = tracer.shade_hits(rays.device, hits)
+        pose, extent = Pose.of(rotation, position), scene.extent
+        hits = trace_primary_rays(terrain, extent, views, pose, rays.device, tree, is_grazing)
+        image = shade_hits(scene, light, terrain, pose, rays.device, hits)
         radiance, body, range_m = to_host(image.radiance), to_host(image.body), to_host(hits.distance)
-        if scene.edge_rays > 1:
-            tracer.smooth_edges(image, hits, radiance)
         columns, rows = rays.size
+        size, side = (UInt32(columns), UInt32(rows)), scene.edge_rays
+        edge_pixels = np.flatnonzero(to_host(mark_edges(image, hits.distance, *size))) if side > 1 else np.empty(0)
+        if len(edge_pixels) > 0:
+            pixel, subpixel_rays = supersample_rays(rays, edge_pixels, side)
+            geometry = terrain, extent, pose, tree
+            subpixel_hits = trace_subpixel_rays(*geometry, *size, pixel, subpixel_rays, hits)
+            subpixels = to_host(shade_hits(scene, light, terrain, pose, subpixel_rays, subpixel_hits).radiance)
+            radiance[edge_pixels] = subpixels.reshape(len(edge_pixels), -1).mean(axis=1)
         radiance, body, range_m = (layer.reshape(rows, columns) for layer in (radiance, body, range_m))
         return Frame(radiance, range_m, body, to_host(image.normal).reshape(rows, columns, 3), world_from_body, rays)
-
-    def close(self) -> None:
-        """Delete the OpenGL contexts."""
-        for view in self._views.values():
-            view.close()
-        self._views.clear()
-        self._last_scene = None
 
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
@@ -217,8 +151,8 @@ class Renderer:
         self,
         scene: Scene,
         rays: PixelRays,
-        rotation: Float64Array[np.ndarray, "3 3"],
-        position: Float64Array[np.ndarray, "3"],
+        rotation: FloatArray[np.ndarray, "3 3"],
+        position: FloatArray[np.ndarray, "3"],
         clearance_m: float,
         numbers: Int64[np.ndarray, "triangles"],
     ) -> Views:
@@ -233,28 +167,12 @@ class Renderer:
             dr.flush_malloc_cache()
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
-        # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border
         columns, rows = rays.size
         probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
         directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
-        low, high = scene.height_range_m
-        descent_rates = np.minimum(directions[:, 2], -1e-9)
-        plane_z = (low, max(high, position[2]))
-        end_distances = [
-            np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_half_width_m) for z in plane_z
-        ]
-        points = np.concatenate([position[:2] + distance[:, None] * directions[:, :2] for distance in end_distances])
-        # between the probe rays the border of the visible ground deviates little from a straight line
-        margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
-        corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-        points = (points[:, None] + corners).reshape(-1, 2)
-        x, y = (
-            grid_lines_between(centre + scene.mesh_offsets, first, last)
-            for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
-        )
-        ground = ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))
+        vertices, faces = visible_mesh(scene, position, directions)
         renderer = self._view_renderer(rays.view_side_px)
-        renderer.load(ground, scene.objects.triangles[numbers], numbers)
+        renderer.load(vertices, faces, scene.objects.triangles[numbers], numbers)
         images = []
         for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
             world_from_view = np.eye(4)
@@ -266,7 +184,22 @@ class Renderer:
             images.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
         depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*images, strict=True))
-        return Views.of(depth, ids, rays.focal_px, rays.view_from_body, rays.device_view_of_pixel)
+        return Views.of(depth, ids, rays)
+
+
+def shade_hits(scene: Scene, light: Light, terrain: Terrain, pose: Pose, rays: Rays, hits: Hits) -> ShadedImage:
+    """Compute radiance, body and normal at the hits of rays."""
+    geometry, materials = (terrain, pose, rays, hits), scene.materials
+    sun_fraction = visible_sun(*geometry, light.sun, light.sun_radius, scene.occluders, materials.objects)
+    return shade(*geometry, light, sun_fraction, materials)
+
+
+def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> tuple[Values, Rays]:
+    """Compute `side` x `side` rays in each of these pixels, and the pixel of each ray."""
+    columns, rows = rays.size
+    pixel = to_device(UInt32, np.repeat(pixels, side**2))
+    ray_in_pixel = to_device(UInt32, np.tile(np.arange(side**2), len(pixels)))
+    return pixel, split_rays(rays.device, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
 
 
 def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:
@@ -317,49 +250,3 @@ def return_freed_memory() -> None:
     malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if malloc_trim is not None:
         malloc_trim(0)
-
-
-def pyramid(surface: Surface) -> tuple[Level, ...]:
-    """Return `LEVELS` levels of a surface; the last level is repeated."""
-    return surface.levels + surface.levels[-1:] * (LEVELS - len(surface.levels))
-
-
-def ground_mesh(
-    surface: Surface,
-    x: FloatArray[np.ndarray, "columns"],
-    y: FloatArray[np.ndarray, "rows"],
-    spans: IntArray[np.ndarray, "strips 2"] | None = None,
-) -> trimesh.Trimesh:
-    """Triangulate the ground over a grid with lines at `x` and `y`, world coordinates.
-
-    To avoid aliasing, each vertex takes its height from the terrain level with about the same spacing as the grid.
-    `spans` contains the first cell and the end of the cells in each strip between two lines of y; by default all cells.
-    """
-    import trimesh  # imported at the first use, because the import is slow
-
-    if spans is None:
-        spans = np.tile([0, x.size - 1], (y.size - 1, 1))
-    level_of_x, level_of_y = (
-        np.clip(np.floor(np.log2(np.gradient(lines) / surface.spacing_m)), 0, len(surface.levels) - 1).astype(int)
-        for lines in (x, y)
-    )
-    vertices, faces = build_mesh(pyramid(surface), surface.spacing_m, x, y, level_of_x, level_of_y, spans)
-    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
-
-
-def cell_spans_in_hull(
-    x: FloatArray[np.ndarray, "columns"], y: FloatArray[np.ndarray, "rows"], points: FloatArray[np.ndarray, "points 2"]
-) -> IntArray[np.ndarray, "strips 2"]:
-    """Find the spans of cells, for `ground_mesh`, that overlap the convex hull of points (not all on a line)."""
-    return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
-
-
-def grid_lines_between(
-    lines: FloatArray[np.ndarray, "count"], low: float, high: float
-) -> FloatArray[np.ndarray, "selected"]:
-    """Select the grid lines between two bounds, with a margin of two lines on each side; at least three lines."""
-    first = max(int(np.searchsorted(lines, low)) - 2, 0)
-    last = min(int(np.searchsorted(lines, high)) + 2, lines.size)
-    if last - first < 3:
-        first, last = max(min(first, lines.size - 3), 0), min(max(last, 3), lines.size)
-    return lines[first:last]

@@ -1,5 +1,6 @@
 """A rover as an object on the ground, with the parts that hazard images and its shadow show."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -94,7 +95,8 @@ def rover_objects(
     wheels = np.array([rover.front_m + rover.rear_m, 2.0 * rover.half_track_m]) + size[[0, 2]] * (2.0, 1.0)
     bottom = np.column_stack([corners * wheels, np.full(4, rover.clearance_m)])
     top = np.column_stack([corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
-    return Objects.join(bodies).with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
+    shelter = np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top])))
+    return replace(Objects.join(bodies), shelter=shelter)
 
 
 def _create_body(solid: Solid, albedo: float) -> Objects:

@@ -3,43 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64 as FloatArray
-from scipy.ndimage import binary_dilation
-from scipy.optimize import brentq
 
 from marsyard.sim.render.arrays import to_device, vectors_to_device
-from marsyard.sim.render.casters import Casters, list_casters
-from marsyard.sim.render.cones import Bounds, Cone, Spheres, ground_in_cones, potentially_visible, spheres_in_cone
-from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32
+from marsyard.sim.render.casters import casters_towards
+from marsyard.sim.render.clouds import CloudLayer
+from marsyard.sim.render.cones import Bounds, Cone, ground_in_cones, potentially_visible, spheres_in_cone
+from marsyard.sim.render.device import Array3f, Array3f64, Float, Float64, Int32
 from marsyard.sim.render.ground import Extent
-from marsyard.sim.render.ground_shadow import compute_ground_shadow, is_sun_above_slopes, slope_bounds
-from marsyard.sim.render.kernels.sweep import height_range
+from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.render.objects import Objects
+from marsyard.sim.render.obstructions import MOUND_RANGE, Mounds, Obstructions, Shelter
 from marsyard.sim.render.pebbles import PebbleField
-from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
+from marsyard.sim.render.photometry import Photometry
 from marsyard.sim.render.rock_surface import describe_grain
 from marsyard.sim.render.shading import Light, Materials
-from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
-from marsyard.sim.render.skylight import MOUND_RANGE, Mounds, Obstructions, Shelter
+from marsyard.sim.render.shadows import Footprint, ObjectSurfaces, Occluders
+from marsyard.sim.render.sky import Sun
 from marsyard.sim.render.skyline import Relief, Skyline
 from marsyard.sim.render.spline import Terrain
-from marsyard.sim.render.sunlight import Footprint, GroundShadow
-from marsyard.sim.render.texture import MicroRelief, RoughGround
+from marsyard.sim.render.texture import MicroRelief, RoughGround, Texture
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.sites import SitePebbles
-from marsyard.sim.terrain.surface import UNIFORM
+from marsyard.sim.terrain.surface import HEIGHT, UNIFORM
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_RELIEF = MicroRelief(1.0, np.empty(0), UNIFORM, 0.0)
-#: Maximum number of cells along a side of a shadow footprint (`shadow_footprint`).
-MAX_CELLS = 512
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class Scene:
     - mesh_finest_m, mesh_half_width_m, mesh_lines: spacing of the mesh at the centre, its half width, and its number of
       lines along each axis
     - among_objects: whether the camera is among the objects, so that nearly all visible ground may be in their shadows.
-      Otherwise the shaded region is computed in advance, and only its pixels are tested (`shadow_footprint`)
+      Otherwise the shaded region is computed in advance, and only its pixels are tested (`shadows.Footprint`)
     - edge_rays: rays along each side of a pixel at an edge (`marsyard.sim.render.renderer`); with 1, one ray per pixel
     - visible_m: minimum and maximum x, then y, of the visible ground; None for no bounds
     """
@@ -85,59 +80,45 @@ class Scene:
     edge_rays: int = 2
     visible_m: Bounds | None = None
 
-    @cached_property
-    def mesh_offsets(self) -> FloatArray[np.ndarray, "lines"]:
-        """Offsets of the mesh lines from the centre, metres."""
-        return graded_offsets(self.mesh_half_width_m, self.mesh_finest_m, self.mesh_lines)
-
     def with_objects(self, objects: Objects) -> Scene:
-        """Return the scene with other objects; cached results of the ground are kept."""
-        return self._keep_results(
-            replace(self, objects=objects), "mesh_offsets", "height_range_m", "max_slopes", "shadow"
-        )
+        """Return the scene with other objects."""
+        return self._replace("height_range_m", "max_slopes", "shadow", objects=objects)
 
     def with_light(self, sun: Sun, photometry: Photometry) -> Scene:
-        """Return the scene with another light; cached results that do not depend on the light are kept."""
-        scene = self._keep_results(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
+        """Return the scene with another light."""
         # infinite bounds of the slope depend on the direction of the sun
-        return self._keep_results(scene, "max_slopes") if np.all(np.isfinite(self.max_slopes)) else scene
+        slopes = ("max_slopes",) if np.all(np.isfinite(self.max_slopes)) else ()
+        return self._replace("height_range_m", *slopes, sun=sun, photometry=photometry)
 
     def with_mesh(self, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int) -> Scene:
-        """Return the scene with another mesh of the ground; all other cached results are kept."""
-        scene = self.with_viewpoint(self.objects, centre_m, finest_m, half_width_m, lines)
-        return self._keep_results(scene, "shadow")
+        """Return the scene with another mesh of the ground."""
+        mesh = {"centre_m": centre_m, "mesh_finest_m": finest_m, "mesh_half_width_m": half_width_m, "mesh_lines": lines}
+        return self._replace("height_range_m", "max_slopes", "shadow", **mesh)
 
     def with_viewpoint(
         self, objects: Objects, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int
     ) -> Scene:
         """Return the scene for another camera, with other objects and another mesh of the same ground."""
-        scene = replace(
-            self,
-            objects=objects,
-            centre_m=centre_m,
-            mesh_finest_m=finest_m,
-            mesh_half_width_m=half_width_m,
-            mesh_lines=lines,
-        )
-        return self._keep_results(scene, "height_range_m", "max_slopes")
+        mesh = {"centre_m": centre_m, "mesh_finest_m": finest_m, "mesh_half_width_m": half_width_m, "mesh_lines": lines}
+        return self._replace("height_range_m", "max_slopes", objects=objects, **mesh)
 
     def with_edge_rays(self, edge_rays: int) -> Scene:
-        """Return the scene with another number of rays at edges; all cached results are kept."""
-        return self._replace_and_keep_results(edge_rays=edge_rays)
+        """Return the scene with another number of rays at edges."""
+        return self._replace(*self._results, edge_rays=edge_rays)
 
     def with_photometry(self, photometry: Photometry) -> Scene:
-        """Return the scene with another photometry under the same sun; all cached results are kept."""
-        return self._replace_and_keep_results(photometry=photometry)
+        """Return the scene with another photometry under the same sun."""
+        return self._replace(*self._results, photometry=photometry)
 
-    def _replace_and_keep_results(self, **changes: Any) -> Scene:
-        """Return a changed scene with all cached results; the changes must not invalidate any."""
+    @property
+    def _results(self) -> set[str]:
+        """Names of the cached results that exist."""
+        return set(self.__dict__) - {field.name for field in fields(self)}
+
+    def _replace(self, *results: str, **changes: Any) -> Scene:
+        """Return a changed scene that has these cached results of this one, which remain valid."""
         scene = replace(self, **changes)
-        scene.__dict__.update(self.__dict__ | changes)
-        return scene
-
-    def _keep_results(self, scene: Scene, *names: str) -> Scene:
-        """Copy cached results of this scene to a changed scene for which they are valid."""
-        scene.__dict__.update({name: getattr(self, name) for name in names})
+        scene.__dict__.update({name: getattr(self, name) for name in results})
         return scene
 
     def restrict_to_cones(self, cones: Sequence[Cone]) -> Scene:
@@ -151,8 +132,8 @@ class Scene:
             if self.among_objects:
                 hides_sky |= spheres_in_cone(sky_spheres, *cone)
         objects = self.objects.select(is_visible, hides_sky)
-        scene = replace(self, objects=objects, visible_m=ground_in_cones(cones, min_height))
-        return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
+        visible_m = ground_in_cones(cones, min_height)
+        return self._replace("height_range_m", "max_slopes", objects=objects, visible_m=visible_m)
 
     @property
     def extent(self) -> Extent:
@@ -175,8 +156,9 @@ class Scene:
     @cached_property
     def height_range_m(self) -> tuple[float, float]:
         """Minimum and maximum height of the ground, metres."""
-        low, high = height_range(self.surface.levels[0])
-        return float(low), float(high)
+        # control values bound the surface
+        heights = self.surface.levels[0][..., HEIGHT]
+        return float(heights.min()), float(heights.max())
 
     @cached_property
     def max_slopes(self) -> tuple[float, float]:
@@ -196,7 +178,7 @@ class Scene:
         if self.among_objects:
             return None
         sun = np.asarray(self.sun.direction, dtype=np.float64)
-        return shadow_footprint(self.objects.spheres, sun, self.height_range_m[0])
+        return Footprint.of(self.objects.spheres, sun, self.height_range_m[0])
 
     @cached_property
     def occluders(self) -> Occluders:
@@ -221,12 +203,18 @@ class Scene:
         """Relief, textures, normals and albedo."""
         objects, surfaces = self.objects, None
         if len(objects) > 0:
+            # dust covers a part of the level faces of rocks
+            covered = self.dust_cover * objects.is_rock
+            dust_albedo = (1.0 - covered) * objects.albedo + covered * self.dust_albedo
+            # only rocks with texture have grain
+            sizes = 0.5 * (objects.bounds[:, 3:5] - objects.bounds[:, :2]).sum(axis=1)
+            sizes *= objects.is_rock & bool(self.object_texture.amplitudes)
             surfaces = ObjectSurfaces(
                 vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
                 to_device(Int32, objects.body_of_triangle),
                 to_device(Float, objects.albedo),
-                to_device(Float, self._dust_albedo()),
-                to_device(Float, self._grain()),
+                to_device(Float, dust_albedo),
+                to_device(Float, describe_grain(objects.names, sizes)),
             )
         return Materials(
             RoughGround.of(self.relief),
@@ -235,17 +223,6 @@ class Scene:
             self.object_texture.octaves,
             surfaces,
         )
-
-    def _dust_albedo(self) -> FloatArray[np.ndarray, "bodies"]:
-        """Mean albedo of the level faces of each body: dust covers a part of those of rocks."""
-        covered = self.dust_cover * self.objects.is_rock
-        return np.asarray((1.0 - covered) * self.objects.albedo + covered * self.dust_albedo)
-
-    def _grain(self) -> FloatArray[np.ndarray, "bodies 4"]:
-        """Grain of each rock; none without texture."""
-        sizes = 0.5 * (self.objects.bounds[:, 3:5] - self.objects.bounds[:, :2]).sum(axis=1)
-        has_grain = self.objects.is_rock & bool(self.object_texture.amplitudes)
-        return describe_grain(self.objects.names, sizes * has_grain)
 
     def light(self, time_s: float) -> Light:
         """Return the illumination at a time."""
@@ -265,60 +242,3 @@ class Scene:
             self.obstructions,
             self.skyline,
         )
-
-
-def graded_offsets(half_width_m: float, finest_m: float, count: int) -> FloatArray[np.ndarray, "count"]:
-    """Compute increasing offsets ``a sinh(b i)`` from -half_width_m to half_width_m, with spacing `finest_m` at 0.
-
-    The spacing grows in proportion to the distance, as the footprint of a pixel does. Raises ValueError if `count` is
-    even, or if `count` offsets with a constant spacing of `finest_m` exceed `half_width_m`.
-    """
-    if count % 2 == 0:
-        raise ValueError(f"{count} offsets have no middle; an odd number is needed")
-    steps = np.arange(count) - (count - 1) / 2.0
-    last = steps[-1]
-    if finest_m * last >= half_width_m:
-        raise ValueError(f"{count} offsets with a spacing of {finest_m:g} m exceed {half_width_m:g} m")
-    log_ratio = np.log(half_width_m / finest_m)
-    b = brentq(lambda x: np.log(np.sinh(x * last) / np.sinh(x)) - log_ratio, 1e-6 / last, 500.0 / last, xtol=1e-15)
-    return np.asarray(finest_m / np.sinh(b) * np.sinh(b * steps))
-
-
-def shadow_footprint(spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_height_m: float) -> Footprint | None:
-    """Mark the cells of a grid where a body may hide the sun from ground with a height of at least `min_height_m`.
-
-    The shadow of a sphere extends along the sun's azimuth from the point below its centre to the point where the ray
-    past its top meets the lowest ground. Returns None without bodies or sun.
-    """
-    if len(spheres) == 0 or sun[2] <= 0.0:
-        return None
-    starts = spheres[:, :2]
-    lengths = np.maximum(spheres[:, 2] + spheres[:, 3] - min_height_m, 0.0) / sun[2]
-    ends = starts - lengths[:, None] * sun[:2]
-    low, high = np.minimum(starts, ends).min(axis=0), np.maximum(starts, ends).max(axis=0)
-    # a cell is longer than a body's radius and half a step together: the dilation by one cell covers both
-    cell = float(max((high - low).max() / MAX_CELLS, 2.0 * spheres[:, 3].max(), 1e-3))
-    steps = int(np.ceil(2.0 * float(np.linalg.norm(ends - starts, axis=1).max()) / cell)) + 2
-    fraction = np.linspace(0.0, 1.0, steps)[:, None, None]
-    positions = (starts + fraction * (ends - starts)).reshape(-1, 2)
-    corner = low - 2.0 * cell
-    columns, rows = (np.floor((high - corner) / cell).astype(int) + 3).tolist()
-    cells = np.zeros((rows, columns), dtype=np.bool_)
-    column, row = np.floor((positions - corner) / cell).astype(int).T
-    cells[row, column] = True
-    cells = binary_dilation(cells, np.ones((3, 3), dtype=np.bool_))
-    return Footprint(
-        to_device(Bool, cells), Int32(rows), Int32(columns), Float64(corner[0]), Float64(corner[1]), Float64(1.0 / cell)
-    )
-
-
-def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
-    """List the triangles that can cast shadows, in grids perpendicular to the sun's direction; None without any."""
-    if len(objects) == 0:
-        return None
-    direction = np.asarray(sun.direction, dtype=np.float64)
-    first_axis = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
-    first_axis /= np.linalg.norm(first_axis)
-    # the kernel's rays are exactly parallel to the third axis
-    axes = np.stack([first_axis, np.cross(direction, first_axis), direction])
-    return list_casters(objects.corners, objects.first_triangle, axes)

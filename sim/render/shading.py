@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, where
+from marsyard.sim.render.clouds import Clouds
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.obstructions import Obstructions
 from marsyard.sim.render.pebbles import PebbleField, pebble_surface
-from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
-from marsyard.sim.render.reflectance import Angles, Law, Sky
+from marsyard.sim.render.photometry import Angles, Law
+from marsyard.sim.render.primary import Hits, Points, locate
+from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.rock_surface import WEAR, RockSurface, dust_cover, rock_surface, texture_frame
 from marsyard.sim.render.shadows import ObjectSurfaces
-from marsyard.sim.render.skylight import Obstructions
+from marsyard.sim.render.sky import Sky
 from marsyard.sim.render.skyline import Skyline
 from marsyard.sim.render.spline import Terrain, evaluate
-from marsyard.sim.render.sunlight import Clouds, disc_overlap
 from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
@@ -106,6 +108,16 @@ def _sample_ground(terrain: Terrain, points: Points, level: Values) -> _Surface:
         lambda total, weight, level, is_active: is_active,
         add_level,
     )[0]
+
+
+def disc_overlap(first: Values, second: Values, distance: Values) -> Values:
+    """Fraction of the second disc that the first disc covers, from their radii and the distance of their centres."""
+    alpha = dr.acos(clip((distance**2 + first**2 - second**2) / (2.0 * distance * first), -1.0, 1.0))
+    beta = dr.acos(clip((distance**2 + second**2 - first**2) / (2.0 * distance * second), -1.0, 1.0))
+    lens = first**2 * (alpha - 0.5 * dr.sin(2.0 * alpha)) + second**2 * (beta - 0.5 * dr.sin(2.0 * beta))
+    is_inside = distance <= dr.abs(first - second)
+    fraction = dr.select(is_inside, smaller((first / second) ** 2, 1.0), lens / (dr.pi * second**2))
+    return dr.select(distance >= first + second, 0.0, fraction)
 
 
 @compiled

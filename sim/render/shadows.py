@@ -1,15 +1,70 @@
 """The fraction of the sun's disc that ground and objects leave visible at the points that rays meet."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
+import numpy as np
+from jaxtyping import Float64 as FloatArray
+from scipy.ndimage import binary_dilation
 
-from marsyard.sim.render.arrays import Values, compiled, larger, where
+from marsyard.sim.render.arrays import Values, compiled, larger, to_device, where
 from marsyard.sim.render.casters import Casters, are_occluded
-from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, UInt32
-from marsyard.sim.render.primary import Hits, Pose, Rays, locate
+from marsyard.sim.render.cones import Spheres
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.ground_shadow import COARSE_GRID_MARGIN, GroundShadow, disc_above, march_to_sun
+from marsyard.sim.render.primary import Hits, locate
+from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.spline import Terrain, evaluate
-from marsyard.sim.render.sunlight import COARSE_GRID_MARGIN, Footprint, GroundShadow, disc_above, march_to_sun
+
+#: Maximum number of cells along a side of a footprint.
+MAX_CELLS = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """Region of ground that objects may shade: a grid of flags, its west and south border, and cells per metre."""
+
+    cells: Values
+    rows: Values
+    columns: Values
+    west: Values
+    south: Values
+    per_metre: Values
+
+    @classmethod
+    def of(cls, spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_height_m: float) -> Footprint | None:
+        """Mark the cells where a body may hide the sun from ground with a height of at least `min_height_m`.
+
+        The shadow of a sphere extends along the sun's azimuth from the point below its centre to the point where the
+        ray past its top meets the lowest ground. Returns None without bodies or sun.
+        """
+        if len(spheres) == 0 or sun[2] <= 0.0:
+            return None
+        starts = spheres[:, :2]
+        lengths = np.maximum(spheres[:, 2] + spheres[:, 3] - min_height_m, 0.0) / sun[2]
+        ends = starts - lengths[:, None] * sun[:2]
+        low, high = np.minimum(starts, ends).min(axis=0), np.maximum(starts, ends).max(axis=0)
+        # a cell is longer than a body's radius and half a step together: the dilation by one cell covers both
+        cell = float(max((high - low).max() / MAX_CELLS, 2.0 * spheres[:, 3].max(), 1e-3))
+        steps = int(np.ceil(2.0 * float(np.linalg.norm(ends - starts, axis=1).max()) / cell)) + 2
+        fraction = np.linspace(0.0, 1.0, steps)[:, None, None]
+        positions = (starts + fraction * (ends - starts)).reshape(-1, 2)
+        corner = low - 2.0 * cell
+        columns, rows = (np.floor((high - corner) / cell).astype(int) + 3).tolist()
+        cells = np.zeros((rows, columns), dtype=np.bool_)
+        column, row = np.floor((positions - corner) / cell).astype(int).T
+        cells[row, column] = True
+        cells = binary_dilation(cells, np.ones((3, 3), dtype=np.bool_))
+        border = map(Float64, (*corner, 1.0 / cell))
+        return cls(to_device(Bool, cells), Int32(rows), Int32(columns), *border)
+
+    def contains(self, x: Values, y: Values) -> Values:
+        """Return whether an object may hide the sun from the ground at a position."""
+        column, row = (Int32(dr.floor(d * self.per_metre)) for d in (x - self.west, y - self.south))
+        is_inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        return dr.gather(Bool, self.cells, UInt32(row * self.columns + column), is_inside)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from jaxtyping import Float64 as FloatArray
 from marsyard.sim.render.arrays import Values, clip, larger, to_device
 from marsyard.sim.render.device import Array3f, Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane
-from marsyard.sim.render.reflectance import Angles, Law
+from marsyard.sim.render.photometry import Angles, Law
 
 #: Spurs and gullies on the faces: width, radians (three times the height, because faces are seen at a low angle), and
 #: slope across them divided by that of the face (assumed).

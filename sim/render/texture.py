@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import drjit as dr
 import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
+from jaxtyping import Float64 as Float64Array
+from scipy.special import gamma, kv
 
-from marsyard.sim.render.arrays import Values, larger, smaller, to_device
+from marsyard.sim.render.arrays import PeriodicGrid, Values, larger, smaller, to_device
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane, noise_in_space
-from marsyard.sim.render.sunlight import Grid
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
 #: Mean square of `noise_in_space`; mean squares of `noise_in_plane` and of its derivative along one axis.
 NOISE_VARIANCE, HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0732, 0.0464, 0.3886
+#: Median frequency of the power of `noise_in_plane`, cycles per cell; size of the finest cells of relief, metres.
+WAVES_PER_CELL, FINEST_M = 0.61, 0.001
 #: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
 #: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
 #: cycles per cell, its slopes of 0.61; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist
@@ -81,6 +85,23 @@ def log_relative_albedo(
 
 
 @dataclass(frozen=True)
+class Texture:
+    """Albedo variation finer than the terrain's samples: octaves of three-dimensional noise, evaluated per pixel.
+
+    - coarsest_m: size of the coarsest octave's cells; each further octave is half as large
+    - amplitudes: amplitude of each octave in the natural logarithm of albedo, coarsest first
+    """
+
+    coarsest_m: float = 1.0
+    amplitudes: tuple[float, ...] = ()
+
+    @property
+    def octaves(self) -> Octaves:
+        """The octaves on the device."""
+        return Octaves.of(self.coarsest_m, self.amplitudes)
+
+
+@dataclass(frozen=True)
 class MicroRelief:
     """Octaves of height noise on the ground, and maps of their strength. Without octaves `heights` is empty.
 
@@ -108,15 +129,15 @@ class RoughGround:
 
     octaves: Octaves
     variance_from: Values
-    roughness: Grid
-    texture: Grid
+    roughness: PeriodicGrid
+    texture: PeriodicGrid
 
     @classmethod
     def of(cls, relief: MicroRelief) -> RoughGround | None:
         """Copy micro-relief to the device; None without octaves."""
         if len(relief.heights) == 0:
             return None
-        roughness, texture = (Grid.of(relief.factors[..., k], relief.per_metre) for k in (ROUGHNESS, TEXTURE))
+        roughness, texture = (PeriodicGrid.of(relief.factors[..., k], relief.per_metre) for k in (ROUGHNESS, TEXTURE))
         gains = relief.heights / (relief.coarsest * 0.5 ** np.arange(len(relief.heights)))
         variance_from = SLOPE_VARIANCE * np.cumsum([0.0, *gains[::-1] ** 2])[::-1]
         octaves = Octaves.of(relief.coarsest, relief.heights)
@@ -174,3 +195,31 @@ def smith_shadowing(cosine: Values, variance: Values) -> Values:
     a = smaller(cosine / dr.sqrt(larger(2.0 * variance * (1.0 - cosine * cosine), 1e-30)), 1.6)
     numerator = 3.535 * a + 2.181 * a * a
     return dr.select(a < 1.6, numerator / (numerator + 1.0 - 1.259 * a + 0.396 * a * a), 1.0)
+
+
+@cache
+def octave_heights(
+    hurst: float, slope_rad: float, baseline_m: float, outer_scale_m: float, spacing_m: float
+) -> tuple[float, Float64Array[np.ndarray, "octaves"]]:
+    """Compute the cell size of the coarsest octave and the amplitude of each octave of height noise, metres.
+
+    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`) with the Hurst
+    exponent H and the wavenumber k0 of the outer scale. Its correlation function c is Matérn's. Its variance follows
+    from the slope over the baseline L: ``(tan(slope) L)**2 = 2 variance (1 - c(L))``. An octave from k1 = k / sqrt(2)
+    to k2 = k sqrt(2) around the wavenumber k has the fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of
+    this variance.
+    """
+    k0 = 2.0 * np.pi / outer_scale_m
+    scaled_lag = k0 * baseline_m
+    correlation = 2.0 ** (1.0 - hurst) / gamma(hurst) * scaled_lag**hurst * kv(hurst, scaled_lag)
+    variance = (np.tan(slope_rad) * baseline_m) ** 2 / (2.0 * (1.0 - correlation))
+    # the median frequency of the coarsest octave is the Nyquist frequency of the samples
+    coarsest = WAVES_PER_CELL * 2.0 * spacing_m
+    octaves = max(int(np.log2(coarsest / FINEST_M)) + 1, 0)
+    wavenumber = 2.0 * np.pi * WAVES_PER_CELL / (coarsest * 0.5 ** np.arange(octaves))
+    fraction_above_k1, fraction_above_k2 = (
+        (1.0 + (wavenumber * factor / k0) ** 2) ** -hurst for factor in (np.sqrt(0.5), np.sqrt(2.0))
+    )
+    heights = np.sqrt(variance * (fraction_above_k1 - fraction_above_k2) / HEIGHT_VARIANCE)
+    heights.setflags(write=False)
+    return coarsest, heights

@@ -15,7 +15,7 @@ from jaxtyping import Int64
 
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, to_host, vectors_to_device, where
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
-from marsyard.sim.render.ground import Ray
+from marsyard.sim.render.rays import Ray
 
 Triangles = FloatArray[np.ndarray, "triangles 3 3"]
 #: Relative margin of bounds and of triangles in single precision, larger than rounding errors.
@@ -152,32 +152,6 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: Values, active: Values) -> 
     number = dr.gather(UInt32, tree.numbers, nearest, is_hit)
     t, u, v = intersect(ray, *(dr.gather(Array3f64, tree.corners, 3 * number + k, is_hit) for k in range(3)))
     return dr.select(is_hit, TriangleHit(t, Int32(number), u, v), no_hit(dr.inf))
-
-
-def body_bounds(
-    triangles: Triangles, first_triangle: Int64[np.ndarray, "bodies+1"]
-) -> FloatArray[np.ndarray, "bodies 6"]:
-    """Minimum x, y, z, then maximum x, y, z of each body.
-
-    `first_triangle` contains the first triangle of each body, and the number of triangles at the end.
-    """
-    if len(first_triangle) == 1:
-        return np.empty((0, 6))
-    a, b, c = (triangles[:, corner] for corner in range(3))
-    extremes = (ufunc.reduceat(ufunc(ufunc(a, b), c), first_triangle[:-1]) for ufunc in (np.minimum, np.maximum))
-    return np.concatenate(list(extremes), axis=1)
-
-
-def bounding_spheres(
-    triangles: Triangles, first_triangle: Int64[np.ndarray, "bodies+1"], bounds: FloatArray[np.ndarray, "bodies 6"]
-) -> FloatArray[np.ndarray, "bodies 4"]:
-    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre."""
-    if len(bounds) == 0:
-        return np.empty((0, 4))
-    centres = 0.5 * (bounds[:, :3] + bounds[:, 3:])
-    centre_of_triangle = np.repeat(centres, np.diff(first_triangle), axis=0)
-    squares = np.max([np.square(triangles[:, k] - centre_of_triangle).sum(axis=1) for k in range(3)], axis=0)
-    return np.column_stack([centres, np.sqrt(np.maximum.reduceat(squares, first_triangle[:-1]))])
 
 
 def first_hits(

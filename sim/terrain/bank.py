@@ -1,4 +1,4 @@
-"""Synthesis of terrains from seeds, and the bank of numbered terrains, which can store them on disk for many cases."""
+"""The bank of numbered terrains, which can store them on disk for many cases."""
 
 import hashlib
 import warnings
@@ -8,114 +8,24 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 import numpy as np
-from jaxtyping import Float32
 
 from marsyard.sim.array_cache import CacheWarning, load_array, save_array
 from marsyard.sim.cache import cache_directory, evict_files, touch
-from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
-from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
-from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
-from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
+from marsyard.sim.terrain.landforms.ground import substream
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
-from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
+from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.surface import (
-    ROUGHNESS,
-    TEXTURE,
-    UNIFORM,
-    Surface,
-    empty_aligned,
-    empty_pyramid,
-    level_sides,
-    split_levels,
-)
+from marsyard.sim.terrain.surface import Surface, empty_aligned, level_sides
+from marsyard.sim.terrain.synthesis import synthesise
 
-#: Height of the ridges of fine relief, divided by its mean absolute height (assumed): the ground between them is level.
-RIDGE_HEIGHT = 1.5
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
-_MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "published_sites.py")
+_MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "statistics.py")
 #: Beginning of the identity of a terrain on an imported DTM.
 IMPORTED_TERRAIN = "DTM"
 #: Maximum number of terrains of a bank: one for each case of the largest campaign.
 MAX_TERRAINS = 1_000_000_000
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
-
-
-def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surface:
-    """Synthesise a terrain from parameters and a random stream; the same stream gives bit-identical samples.
-
-    Each landform has its own named substream: a new or changed landform does not change the others. The synthesis is
-    single-threaded, so that the samples do not depend on the number of threads.
-    """
-    p = parameters
-    relief = FractalField.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
-    rms_slope = np.tan(np.radians(p.rms_slope_deg))
-    relief_m = rms_slope / relief.line_slope_rms(p.slope_baseline_m)
-    albedo = FractalField.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
-    contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
-    craters = draw_craters(p, substream(rng, "craters"))
-    # equal random modes: hollows are dark, and crests bright, at all scales
-    albedo_rng = substream(rng, "relief" if p.albedo_follows_relief else "albedo")
-    if p.units is None:
-        height = relief.draw_field(substream(rng, "relief"), relief_m)
-        log_albedo = albedo.draw_field(albedo_rng, contrast)
-        fine = ground = TerrainGround(height, log_albedo, p.spacing_m)
-    else:
-        height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        log_albedo, fine_albedo = albedo.draw_split_field(albedo_rng, contrast, p.fine_below_m)
-        ground = TerrainGround(height, log_albedo, p.spacing_m)
-        fine = TerrainGround(fine_relief, fine_albedo, p.spacing_m)
-    dtm = None
-    if p.source is not None:
-        dtm = embed(p.source, ground.side, ground.spacing_m)
-        detail = extract_fine_detail(fine, dtm) if p.source.roughen else None
-    for name in LANDFORMS:
-        landform = getattr(p, name)
-        if landform is not None:
-            landform.apply(ground, substream(rng, name))
-    factors = UNIFORM
-    if p.units is not None:
-        factors = p.units.apply(ground, craters, substream(rng, "units"))
-        _add_fine_ground(ground, fine, factors, p.relief_log_albedo)
-    if len(craters):
-        add_craters(ground, craters)
-    if p.drifts is not None:
-        p.drifts.apply(ground, substream(rng, "drifts"))
-    if dtm is not None:
-        blend_into_ground(ground, dtm, detail)
-    relative_albedo = np.exp(ground.log_albedo, out=ground.log_albedo)
-    pyramid = empty_pyramid(ground.side)
-    samples = split_levels(pyramid, level_sides(ground.side))[0]
-    interleave_samples(
-        ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
-    )
-    return Surface.from_pyramid(pyramid, ground.spacing_m, factors)
-
-
-def _add_fine_ground(
-    ground: TerrainGround, fine: TerrainGround, factors: Float32[np.ndarray, "side side 3"], relief_log_albedo: float
-) -> None:
-    """Add fine relief and albedo, scaled by the factors of the surface units.
-
-    With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``.
-    The log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
-    """
-    height, log_albedo = fine.height, fine.log_albedo
-    roughness, texture = (
-        refine(np.ascontiguousarray(factors[..., channel]), ground.side) for channel in (ROUGHNESS, TEXTURE)
-    )
-    if relief_log_albedo:
-        np.abs(height, out=height)
-        mean = float(height[::FACTOR_STEP, ::FACTOR_STEP].mean(dtype=np.float64))
-        np.minimum(height, np.float32(RIDGE_HEIGHT * mean), out=height)
-        np.negative(roughness, out=roughness)
-    height *= roughness
-    log_albedo *= texture
-    ground.add(fine)
-    if relief_log_albedo:
-        height *= np.float32(relief_log_albedo / mean)
-        np.add(ground.log_albedo, height, out=ground.log_albedo)
 
 
 @cache
@@ -175,8 +85,11 @@ class TerrainBank:
         return samples
 
     def _build_samples(self, number: int) -> np.ndarray:
-        """Build the samples of a terrain, read-only, in the order of its file."""
-        surface = self._build(number)
+        """Build the samples of a terrain with the wind tails of its rocks, read-only, in the order of its file."""
+        surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
+        if rocks is not None and rocks.tails is not None:
+            field = RockField.draw(surface, rocks, substream(self._rng(number), "rocks"))
+            surface = rocks.tails.apply(surface, field, substream(self._rng(number), "wind tails"))
         samples: np.ndarray = empty_aligned((self._size(),), np.float32)
         np.concatenate([surface.samples, surface.factors.reshape(-1)], out=samples)
         samples.flags.writeable = False
@@ -188,14 +101,6 @@ class TerrainBank:
         factor_side = self._factor_side()
         pyramid, factors = np.split(samples, [samples.size - 3 * factor_side**2])
         return Surface(pyramid, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
-
-    def _build(self, number: int) -> Surface:
-        """Synthesise a terrain, with the wind tails of its rocks."""
-        surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
-        if rocks is None or rocks.tails is None:
-            return surface
-        field = RockField.draw(surface, rocks, substream(self._rng(number), "rocks"))
-        return rocks.tails.apply(surface, field, substream(self._rng(number), "wind tails"))
 
     def missing_bytes(self, number: int) -> int:
         """Return the bytes that a terrain would add on disk, without the header of the file; 0 if it is stored."""

@@ -1,4 +1,4 @@
-"""Parameters of a synthetic terrain, and the order in which its landforms are added."""
+"""Parameters of a synthetic terrain."""
 
 from __future__ import annotations
 
@@ -100,10 +100,6 @@ class TerrainParameters(Parameters):
             first = error.errors()[0]
             location = ".".join(str(part) for part in first["loc"])
             raise ValueError(f"terrain.{location}: {first['msg']}; given: {first['input']!r}") from None
-
-
-#: The landforms in the order in which they are added to the fractal ground; drifts follow the craters.
-LANDFORMS = ("fans", "playa", "lava", "swell", "strata", "ramp", "outcrop", "gullies", "dunes", "ripples")
 
 
 def _check_names(model: type[BaseModel], changes: Mapping[str, Any], prefix: str) -> None:

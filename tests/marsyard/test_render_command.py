@@ -14,8 +14,7 @@ from marsyard.sim.camera import read_cahvor
 from marsyard.sim.kernel_cache import mark_ready
 from marsyard.sim.render import Objects, Sun, scene
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.casters import Casters
-from marsyard.sim.render.scene import casters_towards
+from marsyard.sim.render.casters import Casters, casters_towards
 from tests.command import marsyard
 
 

@@ -3,15 +3,19 @@
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor
-from marsyard.sim.render import Objects, Photometry
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.rocks import RockField
 
 #: Axes of cameras in the body frame: looking down with +x to the right, and looking along +x.
 DOWN: dict[str, Any] = {"axis": (0.0, 0.0, -1.0), "right": (1.0, 0.0, 0.0)}
 FORWARD: dict[str, Any] = {"axis": (1.0, 0.0, 0.0), "right": (0.0, -1.0, 0.0)}
+#: Mesh of the ground for a camera a few metres above it.
+NEAR_MESH: dict[str, Any] = {"mesh_finest_m": 0.2, "mesh_half_width_m": 60.0}
 #: With this law the radiance is albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 
@@ -37,3 +41,18 @@ def rocks_near(field: RockField, x_m: float, y_m: float, radius_m: float, above_
     """Return the rocks around a position as objects."""
     mesh = field.near(x_m, y_m, radius_m, above_m=above_m)
     return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
+
+
+def level_plate(name: int) -> Objects:
+    """Return a square of 2 m around (8 m, 8 m), 0.5 m above the ground, as a body with this name and the albedo 0.2."""
+    corners = np.array([[7.0, 7.0, 0.5], [9.0, 7.0, 0.5], [9.0, 9.0, 0.5], [7.0, 9.0, 0.5]])
+    faces, names = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), np.full(2, name, dtype=np.int32)
+    return Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (4, 1)), faces, names, 0.2)
+
+
+def look_down(
+    renderer: Renderer, scene: Scene, position_m: tuple[float, float, float], field_rad: float, side_px: int
+) -> Frame:
+    """Render a scene by a camera with a square image that looks down from a position, with x to the right."""
+    rays = PixelRays.from_camera(Cahv.from_field_of_view(field_rad, (side_px, side_px), **DOWN))
+    return renderer.render(scene, rays, rigid(Rotation.identity(), np.array(position_m)))

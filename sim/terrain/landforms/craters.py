@@ -43,8 +43,20 @@ LARGEST_SECONDARY_M, SECONDARY_FRACTION, CLUSTER_SIZE, CLUSTER_RADIUS_M = 30.0, 
 _TABLE_SEED = 20040104  #: Seed of the tables of outlines and rays, which are the same for all terrains.
 
 
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 18"]:
-    """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
+#: Columns of `kernels.stamp_craters`, where they are described.
+CRATER = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            *("x", "y", "radius", "depth", "rim", "rounding", "fill", "ejecta_log_albedo", "fill_log_albedo"),
+            *("fill_radius", "lee_x", "lee_y", "outline", "rotation", "extent", "opacity", "margin", "core"),
+        )
+    ]
+)
+
+
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> np.ndarray:
+    """Draw impact craters in order of decreasing size, as a table of type `CRATER`.
 
     Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
     `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
@@ -100,7 +112,7 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
         _gather_secondaries(position, diameter, period, rng)
     shape = (position, diameter / 2.0, depth, rim, rounding, fill)
     albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius, lee)
-    return np.column_stack([*shape, *albedo, outline, rotation, *wear])
+    return np.column_stack([*shape, *albedo, outline, rotation, *wear]).view(CRATER)[:, 0]
 
 
 def _draw_worn_albedo(
@@ -159,14 +171,24 @@ def outline_tables() -> tuple[Float64[np.ndarray, "outlines positions"], Float64
     return tables[0], tables[1]
 
 
-def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 18"]) -> None:
-    """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
-    octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
+def crater_freshness(craters: np.ndarray) -> Float64[np.ndarray, "craters"]:
+    """Return the depth of craters (a table of type `CRATER`) below their rim, relative to that of a fresh crater."""
+    return np.asarray((craters["depth"] + craters["rim"]) / craters["radius"] / (2.0 * FRESH_DEPTH))
+
+
+def crater_rows(craters: np.ndarray) -> Float64[np.ndarray, "craters columns"]:
+    """Return a table of craters as rows of numbers for `kernels.stamp_craters`."""
+    return craters.view(np.float64).reshape(craters.size, CRATER.itemsize // 8)
+
+
+def add_craters(ground: TerrainGround, craters: np.ndarray) -> None:
+    """Add a table of craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
+    octave = np.floor(np.log2(np.maximum(craters["radius"] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
     layer = None
     for step in range(int(octave.max(initial=0.0)), -1, -1):
         grid = ground.coarser(ground.spacing_m * 2.0**step) if step else ground
         if layer is not None:
             grid.add(layer)
-        rows = craters[octave == step]
+        rows = crater_rows(craters[octave == step])
         stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables())
         layer = grid

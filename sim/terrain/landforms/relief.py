@@ -1,4 +1,4 @@
-"""Landforms: dunes, lava flows, swells, ramps, gullies, and the fans and playa of a desert basin."""
+"""Landforms: lava flows, swells, ramps, gullies, and the fans and playa of a desert basin."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
+from marsyard.sim.terrain.landforms.bedrock import locate_points
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
-from marsyard.sim.terrain.landforms.kernels.shapes import Bedforms, add_dunes, cut_channels, raise_cones, stamp_lobes
+from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, raise_cones, stamp_lobes
 
-SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean
 #: square has the factor 151/315 along each axis: the integral of the squared basis function.
@@ -25,54 +25,6 @@ APEX_ROUNDING = 0.06  #: Rounding of a fan's apex, as a fraction of its radius.
 CONE_DETAIL = 1.0 / 50.0  #: Scale of the smallest detail of the fans' broad shape, as a fraction of their radius.
 Channels = Float64[np.ndarray, "channels"]  #: One value per channel.
 Points = Float64[np.ndarray, "channels 2"]
-
-
-class Dunes(Parameters):
-    """A train of transverse bedforms: a gentle windward slope, and a leeward slip face with an apron at its foot.
-
-    Dunes and ripples differ in size. Wind ripples do not avalanche: their lee slope is about 20 deg (Sharp 1963). The
-    slip face of a dune has the angle of repose, 30-34 deg for dry sand (Bagnold 1941). Crests wander and end in
-    defects, as in interacting bedforms of different wavelengths (Werner & Kocurek 1999).
-    """
-
-    wavelength_m: Annotated[Positive, Field(description="distance from crest to crest, m")] = 110.0
-    height_m: Annotated[Positive, Field(description="RMS height of crest over trough, m")] = 5.0
-    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 270.0
-    repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
-    crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
-    regularity: Annotated[
-        float, Field(ge=0.3, le=20.0, description="length over which the spacing persists, wavelengths")
-    ] = 1.5
-    albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
-
-    def apply(self, ground: TerrainGround, rng: Generator) -> None:
-        """Add the dunes."""
-        ground.add(self.create_layer(ground, rng))
-
-    def create_layer(self, ground: TerrainGround, rng: Generator) -> TerrainGround:
-        """Create the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
-        # the wave vector points downwind; azimuth is clockwise from north, x is east
-        downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
-        waves_per_side = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
-        whole_waves = np.round(waves_per_side)
-        if not whole_waves.any():
-            side = f"{ground.period_m:g} m"
-            raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
-        wave_vector = 2.0 * np.pi * whole_waves / ground.period_m
-        # amplitudes of the fields fall to 1/e at the wavenumber 2 / length
-        across_m, along_m = (
-            length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity)
-        )
-        modulation = draw_smooth_fields(ground.period_m, across_m, along_m, float(downwind), rng)
-        step = max(modulation.shape[0] // ground.side, 1)
-        modulation = np.ascontiguousarray(modulation[::step, ::step])
-        max_slope = float(np.tan(np.radians(self.repose_deg)))
-        slip_face_m = self.height_m / max_slope
-        layer = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
-        kx, ky = (float(wavenumber) for wavenumber in wave_vector)
-        bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
-        add_dunes(layer.height, layer.log_albedo, layer.spacing_m, modulation, bedforms)
-        return layer
 
 
 class Lava(Parameters):
@@ -278,7 +230,7 @@ class Playa(Parameters):
         layer = ground.coarser(self.fissure_m)
         for scale in (1.0, 0.4):
             cells = max(round(ground.period_m / (scale * self.polygon_m)), 3)
-            points = rng.uniform(0.1, 0.9, (cells, cells, 2))
+            points = locate_points(rng.uniform(0.1, 0.9, (cells, cells, 2)))
             width = max(scale * self.fissure_m, layer.spacing_m)
             depth, contrast = scale * self.fissure_depth_m, scale * self.contrast
             cell_m = ground.period_m / cells

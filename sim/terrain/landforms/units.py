@@ -8,12 +8,13 @@ Gusev; Sullivan et al. 2005 for Meridiani).
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32
 from numpy.random import Generator
 from pydantic import Field
 from scipy.ndimage import gaussian_filter
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
+from marsyard.sim.terrain.landforms.craters import crater_freshness
 from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround, refine
 from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, scale_roughness, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
@@ -87,12 +88,10 @@ class SurfaceUnits(Parameters):
     streak_min_m: Annotated[Positive, Field(description="smallest diameter of craters with a tail, m")] = 20.0
     streak_log_albedo_rms: Annotated[Fraction, Field(description="RMS of the logarithm of albedo of tails")] = 0.12
 
-    def apply(
-        self, ground: TerrainGround, craters: Float64[np.ndarray, "craters columns"], rng: Generator
-    ) -> Float32[np.ndarray, "side side 3"]:
+    def apply(self, ground: TerrainGround, craters: np.ndarray, rng: Generator) -> Float32[np.ndarray, "side side 3"]:
         """Add the albedo of units, dust devil tracks and wind tails (streaks) of craters to the ground.
 
-        `craters` are rows of `kernels.stamp_craters`. Returns the factors of roughness, texture and rocks (see
+        `craters` is a table of type `CRATER`. Returns the factors of roughness, texture and rocks (see
         `Surface`). Craters change the roughness: filled floors are smoother, fresh ejecta are rougher.
         """
         units = self.kinds
@@ -119,12 +118,13 @@ class SurfaceUnits(Parameters):
         ground.add(TerrainGround(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
-            # columns of `stamp_craters`; depth below the rim, which is 0.4 radii for a fresh crater
-            radius, depth, filled_fraction = craters[:, 2], craters[:, 3] + craters[:, 4], craters[:, 6]
-            freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
             # assumed factors of roughness on the floor and on the ejecta
-            floor_factor, ejecta_factor = 1.0 - 1.6 * filled_fraction, 1.0 + freshness
-            crater_factors = np.column_stack([craters[:, :3], floor_factor, ejecta_factor])
+            floor_factor, ejecta_factor = (
+                1.0 - 1.6 * craters["fill"],
+                1.0 + np.clip(crater_freshness(craters), 0.0, 1.0),
+            )
+            circles = (craters["x"], craters["y"], craters["radius"])
+            crater_factors = np.column_stack([*circles, floor_factor, ejecta_factor])
             roughness = np.ascontiguousarray(factors[..., ROUGHNESS])
             scale_roughness(roughness, spacing, crater_factors, 2.0)
             factors[..., ROUGHNESS] = roughness
@@ -146,36 +146,30 @@ class SurfaceUnits(Parameters):
         cut_channels(darkening, spacing, discs, 2.0)
         log_albedo -= darkening
 
-    def _add_streaks(
-        self, ground: TerrainGround, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
-    ) -> None:
+    def _add_streaks(self, ground: TerrainGround, craters: np.ndarray, downwind: float, rng: Generator) -> None:
         """Add wind tails (streaks) behind a random selection of the craters of at least `streak_min_m`."""
-        large = craters[craters[:, 2] > 0.5 * self.streak_min_m]
+        large = craters[craters["radius"] > 0.5 * self.streak_min_m]
         sources = large[rng.uniform(size=len(large)) < self.streak_fraction]
-        radius, count = sources[:, 2], len(sources)
+        radius, count = sources["radius"], len(sources)
         heading = downwind + 0.12 * rng.standard_normal(count)
         length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
         log_albedo = self.streak_log_albedo_rms * rng.standard_normal(count)
-        streaks = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
+        start = (sources["x"], sources["y"])
+        streaks = np.column_stack([*start, radius, length, np.cos(heading), np.sin(heading), log_albedo])
         stamp_streaks(ground.log_albedo, ground.spacing_m, streaks)
 
-    def _draw_halos(
-        self,
-        craters: Float64[np.ndarray, "craters columns"],
-        side: int,
-        spacing: float,
-        downwind: float,
-        rng: Generator,
-    ) -> Grid:
+    def _draw_halos(self, craters: np.ndarray, side: int, spacing: float, downwind: float, rng: Generator) -> Grid:
         """Draw the surroundings of large craters, 1 at most: long downwind, short upwind, weaker for worn ones."""
-        sources = craters[craters[:, 2] > 0.5 * self.streak_min_m]
-        radius = sources[:, 2]
-        strength = np.minimum((sources[:, 3] + sources[:, 4]) / radius / 0.4 * rng.uniform(0.5, 1.5, len(sources)), 1.0)
+        sources = craters[craters["radius"] > 0.5 * self.streak_min_m]
+        radius = sources["radius"]
+        strength = np.minimum(crater_freshness(sources) * rng.uniform(0.5, 1.5, len(sources)), 1.0)
         halos = np.zeros((side, side), dtype=np.float32)
         for heading, length in ((downwind, rng.uniform(3.0, 12.0, len(sources))), (downwind + np.pi, 4.0)):
             c, s = (np.full(len(sources), value) for value in (np.cos(heading), np.sin(heading)))
             stamp_streaks(
-                halos, spacing, np.column_stack([sources[:, :2], 2.0 * radius, length * radius, c, s, strength])
+                halos,
+                spacing,
+                np.column_stack([sources["x"], sources["y"], 2.0 * radius, length * radius, c, s, strength]),
             )
         return halos
 

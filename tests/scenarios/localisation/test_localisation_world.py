@@ -13,7 +13,7 @@ from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import synthesise
-from marsyard.sim.terrain.surface import terrain_statistics
+from marsyard.sim.terrain.statistics import terrain_statistics
 
 
 def test_sites_are_wider_than_a_map() -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from marsyard.sim.render.backend import RenderingError, default_backend
 from marsyard.sim.render.pinhole import DepthRenderer
@@ -93,9 +92,10 @@ def _make_depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
     return pose, 40.0, 1.0, 100.0
 
 
-def _make_level_ground() -> trimesh.Trimesh:
+def _make_level_ground() -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of a square."""
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    return corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32)
 
 
 def test_load_replaces_the_previous_geometry() -> None:
@@ -114,7 +114,7 @@ def test_load_replaces_the_previous_geometry() -> None:
         (no_triangles, 0),
         ((triangle, np.array([5])), 6),
     ):
-        renderer.load(ground, *triangles)
+        renderer.load(*ground, *triangles)
         for height in (20.0, 10.0):
             depth, numbers = renderer.draw(*_make_depth_view(height))
             # The tolerance is the resolution of a 24-bit depth between 1 and 100 m.
@@ -144,7 +144,7 @@ def test_views_contain_the_first_triangle_of_each_ray(small_renderer: DepthRende
     triangles[is_down] = triangles[is_down, ::-1]
     hidden = np.tile(eye + np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]]), (30_000, 1, 1))
     numbers = rng.permutation(100_000)[:30_040]
-    small_renderer.load(_make_level_ground(), np.concatenate([hidden, triangles]), numbers)
+    small_renderer.load(*_make_level_ground(), np.concatenate([hidden, triangles]), numbers)
     depth, ids = small_renderer.draw(*_make_depth_view(eye[2]))
     x = (np.arange(64) + 0.5 - 32.0) / 40.0
     rays = np.stack([*np.broadcast_arrays(x, -x[:, None], -1.0)], axis=-1)
@@ -188,7 +188,7 @@ def test_shaders_are_compiled_once_and_meshes_are_kept_for_all_views(
     meshes, shaders = (_record_transfers(monkeypatch, kind) for kind in (Primitive, ShaderProgram))
     context_counts = set()
     for loads in (1, 2, 3):
-        small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+        small_renderer.load(*_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
         for height_m in (20.0, 10.0):
             small_renderer.draw(*_make_depth_view(height_m))
         assert len(meshes) == loads
@@ -203,31 +203,27 @@ def test_too_many_vertices_are_reported(small_renderer: DepthRenderer, monkeypat
     monkeypatch.setattr("marsyard.sim.render.pinhole._MAX_VERTICES", 6)
     ground, triangle = _make_level_ground(), np.eye(3)[None]
     with pytest.raises(RenderingError, match="7 vertices are visible; maximum 6"):
-        small_renderer.load(ground, triangle, np.array([0]))
+        small_renderer.load(*ground, triangle, np.array([0]))
     monkeypatch.undo()
-    small_renderer.load(ground, triangle, np.array([0]))
+    small_renderer.load(*ground, triangle, np.array([0]))
 
 
-def test_second_backend_in_one_process_is_rejected() -> None:
+@pytest.mark.parametrize(
+    ("options", "backend", "message"),
+    [
+        ((), "egl", "already uses OpenGL through osmesa"),
+        pytest.param(("-O",), "osmesa", "without -O", marks=pytest.mark.slow),
+    ],
+)
+def test_second_backend_and_python_without_assertions_are_rejected(
+    options: tuple[str, ...], backend: str, message: str
+) -> None:
     program = (
-        "from marsyard.sim.render.backend import RenderingError\n"
-        "from marsyard.sim.render.renderer import create_depth_renderer\n"
         "import OpenGL\n"
-        "try:\n    create_depth_renderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
-    )
-    environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
-    run = subprocess.run(
-        [sys.executable, "-c", program], check=True, env=environment, capture_output=True, text=True, timeout=60
-    )
-    assert "already uses OpenGL through osmesa" in run.stdout
-
-
-@pytest.mark.slow
-def test_python_without_assertions_is_rejected() -> None:
-    program = (
         "from marsyard.sim.render.backend import RenderingError\n"
         "from marsyard.sim.render.renderer import create_depth_renderer\n"
-        "try:\n    create_depth_renderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
+        f"try:\n    create_depth_renderer(64, '{backend}')\nexcept RenderingError as error:\n    print(error)\n"
     )
-    run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
-    assert "without -O" in run.stdout
+    command, environment = [sys.executable, *options, "-c", program], os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
+    run = subprocess.run(command, check=True, env=environment, capture_output=True, text=True, timeout=60)
+    assert message in run.stdout

@@ -54,7 +54,7 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
     camera = _make_camera((7, 5))
     rays = PixelRays.from_camera(camera)
     pixels = np.array([0, 17, 34])
-    subpixel_rays = supersample_rays(rays, pixels, 3)
+    _, subpixel_rays = supersample_rays(rays, pixels, 3)
     result, _ = camera.project(to_host(subpixel_rays.directions).astype(np.float64))
     centres = np.stack([pixels % 7, pixels // 7], axis=-1)
     positions = result.reshape(3, 9, 2) - centres[:, None]

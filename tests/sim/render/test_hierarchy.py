@@ -10,7 +10,7 @@ from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.render import Objects
 from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
-from marsyard.sim.render.ground import Ray
+from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.render.triangles import FEW_RAYS, first_hits, nearest_hit
 from marsyard.sim.terrain import Surface

@@ -20,11 +20,11 @@ from marsyard.sim.render.texture import (
     SLOPE_VARIANCE,
     MicroRelief,
     RoughGround,
+    octave_heights,
     relief_slopes,
     smith_shadowing,
 )
 from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.microrelief import octave_heights
 from tests.sim.scenes import LAMBERT, descent_camera
 
 #: Map of amplitude factors with a single sample, 1: equal relief everywhere.

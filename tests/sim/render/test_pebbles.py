@@ -6,11 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass, gaussian_filter, label
-from scipy.spatial.transform import Rotation
 
-from marsyard.sim.camera import Cahv
-from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Float
 from marsyard.sim.render.pebbles import CELL_DIAMETERS, PebbleField, pebble_surface
@@ -18,10 +16,9 @@ from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import TerrainBank, site
 from marsyard.sim.terrain.sites import SitePebbles
 from marsyard.sim.terrain.surface import Surface
-from tests.sim.scenes import DOWN, LAMBERT, flat_ground
+from tests.sim.scenes import LAMBERT, NEAR_MESH, flat_ground, look_down
 
 ONE_SIZE = SitePebbles(coverage=0.06, largest_m=0.04, smallest_m=0.02, log_albedo=-0.5, log_albedo_sd=0.0)
-MESH: dict[str, Any] = {"mesh_finest_m": 0.2, "mesh_half_width_m": 60.0}
 SUN = Sun(direction(0.5 * np.pi, np.radians(35.0)))
 LEVEL = flat_ground(64, 1.0)
 
@@ -124,16 +121,16 @@ def test_pebbles_fade_where_they_are_smaller_than_a_pixel() -> None:
 
 @pytest.mark.parametrize("elevation_deg", [25.0, 35.0, 60.0])
 def test_pebbles_move_with_the_ground_and_keep_its_mean_brightness(renderer: Renderer, elevation_deg: float) -> None:
-    camera = Cahv.from_field_of_view(0.6, (300, 300), **DOWN)
-    rays, sun = PixelRays.from_camera(camera), Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
+    sun = Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
     plain, pebbly = (
-        Scene(flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=pebbles, **MESH)
+        Scene(flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=pebbles, **NEAR_MESH)
         for pebbles in (None, SitePebbles(coverage=0.2))
     )
     pixel_m = 2.0 * np.tan(0.3) * 1.5 / 300
-    poses = [rigid(Rotation.identity(), np.array([8.0 + 40.0 * step * pixel_m, 8.0, 1.5])) for step in (0, 1)]
-    level = renderer.render(plain, rays, poses[0]).radiance
-    first, second = (renderer.render(pebbly, rays, pose).radiance for pose in poses)
+    level, first, second = (
+        look_down(renderer, scene, (8.0 + 40.0 * step * pixel_m, 8.0, 1.5), 0.6, 300).radiance
+        for scene, step in ((plain, 0), (pebbly, 0), (pebbly, 1))
+    )
     assert first.std() > 10.0 * level.std()
     assert first.mean() == pytest.approx(level.mean(), rel=0.03)
     # the second image is the first one shifted by 40 pixels
@@ -144,14 +141,10 @@ def test_pebbles_move_with_the_ground_and_keep_its_mean_brightness(renderer: Ren
 def test_one_ray_per_pixel_sees_the_mean_over_its_footprint(renderer: Renderer, elevation_deg: float) -> None:
     """Pebbles of one to ten pixels, compared with the means of 36 rays."""
     sun = Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
-    scene = Scene(
-        flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=SitePebbles(coverage=0.25, log_albedo_sd=0.25), **MESH
-    )
-    pose, factor = rigid(Rotation.identity(), np.array([8.0, 8.0, 1.5])), 6
-    images = [
-        renderer.render(scene, PixelRays.from_camera(Cahv.from_field_of_view(0.4, (side, side), **DOWN)), pose).radiance
-        for side in (280, 280 * factor)
-    ]
+    pebbles = SitePebbles(coverage=0.25, log_albedo_sd=0.25)
+    scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=pebbles, **NEAR_MESH)
+    factor = 6
+    images = [look_down(renderer, scene, (8.0, 8.0, 1.5), 0.4, side).radiance for side in (280, 280 * factor)]
     mean = images[1].reshape(280, factor, 280, factor).mean(axis=(1, 3))
     # the ratio is 1.2 for ramps that do not preserve the outline's area and normals of the pixel's centre
     assert images[0].std() / mean.std() == pytest.approx(1.0, abs=0.1)
@@ -166,15 +159,13 @@ def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
     normals = np.repeat([[0.0, 0.0, 1.0], normal / np.linalg.norm(normal)], 4, axis=0)
     faces, body = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32), np.array([0, 0, 1, 1])
     sky_only = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=1.0, surrounding_albedo=0.0)
-    night, camera = Sun(direction(0.0, np.radians(-10.0))), Cahv.from_field_of_view(1.2, (400, 400), **DOWN)
-    pose = rigid(Rotation.identity(), np.array([6.6, 8.2, 3.0]))
-    brightness = {}
+    night, brightness = Sun(direction(0.0, np.radians(-10.0))), {}
     for name in (5, ROVER_NAME):
         names = np.full(4, name, dtype=np.int32)
         objects = Objects.of_mesh(np.concatenate([level, steep]), normals, faces, names, 0.1, body.astype(np.int32))
         dust: dict[str, Any] = {"dust_albedo": 0.5, "dust_cover": 0.8}
-        scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), night, sky_only, objects, **dust, **MESH)
-        frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
+        scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), night, sky_only, objects, **dust, **NEAR_MESH)
+        frame = look_down(renderer, scene, (6.6, 8.2, 3.0), 1.2, 400)
         brightness[name] = [float(np.median(frame.radiance[frame.body == number])) for number in (0, 1)]
     # 0.2 * 0.1 + 0.8 * 0.5 on the rock; a rover has no dust
     assert brightness[5][0] == pytest.approx(0.42, abs=1e-3)

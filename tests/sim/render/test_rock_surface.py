@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from marsyard.sim.camera import Cahv
-from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, PixelRays, Renderer, Scene, Sun, Texture
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Renderer, Scene, Sun, Texture
 from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Float
 from marsyard.sim.render.rock_surface import MAX_BED_RATIO, RockSurface, describe_grain, rock_surface, texture_frame
-from tests.sim.scenes import DOWN, LAMBERT, flat_ground
+from marsyard.sim.render.rover import ROVER_NAME
+from tests.sim.scenes import LAMBERT, NEAR_MESH, flat_ground, level_plate, look_down
 
 
 def _surface(grain: tuple[float, ...], points_m: np.ndarray, footprint_m: float) -> RockSurface:
@@ -63,27 +62,18 @@ def test_dust_has_a_patchy_margin_and_fractures_are_dark_and_rare() -> None:
     assert np.ptp(to_host(steep.dust)) > 0.2
 
 
-def test_grain_needs_texture(renderer: Renderer) -> None:
-    """Without texture a rock is smooth, and its normals in the truth are those of the geometry with and without."""
-    plate = np.array([[7.0, 7.0, 0.5], [9.0, 7.0, 0.5], [9.0, 9.0, 0.5], [7.0, 9.0, 0.5]])
-    faces, names = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), np.zeros(2, dtype=np.int32)
-    objects = Objects.of_mesh(plate, np.tile([0.0, 0.0, 1.0], (4, 1)), faces, names, 0.2)
-    camera = Cahv.from_field_of_view(0.5, (60, 60), **DOWN)
-    pose = rigid(Rotation.identity(), np.array([8.0, 8.0, 3.0]))
-    sun, contrast = Sun(direction(0.0, np.radians(40.0))), []
-    for texture in (Texture(), Texture(0.2, (0.01,))):
-        scene = Scene(
-            flat_ground(64, 1.0),
-            (8.0, 8.0),
-            sun,
-            LAMBERT,
-            objects,
-            object_texture=texture,
-            mesh_finest_m=0.2,
-            mesh_half_width_m=60.0,
-        )
-        frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
-        contrast.append(frame.radiance.std() / frame.radiance.mean())
-        assert frame.normal.reshape(-1, 3) == pytest.approx(np.tile([0.0, 0.0, 1.0], (3600, 1)), abs=1e-6)
-    assert contrast[0] < 1e-3
-    assert contrast[1] > 0.05
+@pytest.mark.parametrize(
+    ("name", "amplitudes", "contrast"),
+    [(5, (), (0.0, 1e-3)), (5, (0.12,) * 7, (0.1, 1.0)), (ROVER_NAME, (0.12,) * 7, (1e-6, 0.02))],
+    ids=["bare rock", "rock", "rover"],
+)
+def test_rocks_have_grain_and_rovers_slight_wear_where_there_is_texture(
+    renderer: Renderer, name: int, amplitudes: tuple[float, ...], contrast: tuple[float, float]
+) -> None:
+    """The normals in the truth are those of the geometry."""
+    sun, texture = Sun(direction(0.0, np.radians(40.0))), Texture(0.2, amplitudes)
+    plate, ground = level_plate(name), flat_ground(64, 1.0)
+    scene = Scene(ground, (8.0, 8.0), sun, LAMBERT, plate, object_texture=texture, **NEAR_MESH)
+    frame = look_down(renderer, scene, (8.0, 8.0, 3.0), 0.5, 60)
+    assert contrast[0] <= frame.radiance.std() / frame.radiance.mean() < contrast[1]
+    assert frame.normal.reshape(-1, 3) == pytest.approx(np.tile([0.0, 0.0, 1.0], (3600, 1)), abs=1e-6)

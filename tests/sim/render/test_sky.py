@@ -82,22 +82,6 @@ def test_sky_radiance_matches_the_formula(renderer: Renderer) -> None:
     np.testing.assert_allclose(source, source.mean(), rtol=1e-2)
 
 
-def test_sky_is_brighter_towards_the_sun_and_the_horizon(renderer: Renderer) -> None:
-    camera = _make_sky_camera()
-    isotropic_photometry = replace(DUSTY, sky=DustySky(0.1, 0.95, 0.0))
-    towards_sun, away_from_sun, isotropic = (
-        _render_from_mast(renderer, camera, Sun(direction(azimuth, np.radians(40.0))), photometry).radiance[:, 100]
-        for azimuth, photometry in ((0.0, DUSTY), (np.pi, DUSTY), (np.pi, isotropic_photometry))
-    )
-    _, directions = camera.rays(camera.pixel_grid())
-    top, middle, bottom = (
-        int(np.abs(directions[:, 100, 2] - np.sin(np.radians(elevation_deg))).argmin())
-        for elevation_deg in (28.0, 15.0, 1.5)
-    )
-    assert towards_sun[top] > 2.0 * away_from_sun[top]
-    assert isotropic[bottom] > isotropic[middle] > isotropic[top]
-
-
 def test_solar_disc_contains_the_direct_irradiance(renderer: Renderer) -> None:
     camera = _make_sky_camera(400)
     sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
@@ -160,24 +144,15 @@ def test_cover_and_size_equal_the_parameters(cover: float) -> None:
     assert is_cloud.sum() / n_crossings * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
-def test_sunlight_is_attenuated_by_the_optical_depth(renderer: Renderer) -> None:
-    layer = _make_layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
-    frame = _render_from_above(renderer, _make_scene(layer), descent_camera(128))
-    elevation = np.radians(50.0)
-    sunlight = ALBEDO * np.sin(elevation)
-    skylight = layer.parameters.sky_light(SUN) * ALBEDO
-    assert frame.radiance.max() == pytest.approx(sunlight + skylight, rel=1e-4)
-    assert frame.radiance.min() == pytest.approx(sunlight * np.exp(-1.0 / np.sin(elevation)) + skylight, rel=1e-3)
-
-
 def test_rendered_transmittance_equals_truth(renderer: Renderer) -> None:
-    scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
+    scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=2.0))
     frame = _render_from_above(renderer, scene, descent_camera(128), time_s=12.0)
     transmittance = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
     sky_light = scene.clouds.parameters.sky_light(SUN)
     expected = ALBEDO * (SUN.direction[2] * transmittance + sky_light)
     np.testing.assert_allclose(frame.radiance, expected, rtol=2e-5, atol=1e-6)
     assert 0.1 < np.mean(transmittance < 0.5) < 0.9
+    assert transmittance.min() == pytest.approx(np.exp(-2.0 / np.sin(np.radians(50.0))), rel=1e-3)
 
 
 def test_shadows_move_with_the_wind(renderer: Renderer) -> None:

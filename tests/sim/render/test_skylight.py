@@ -17,8 +17,9 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f, Array3f64, Bool
+from marsyard.sim.render.obstructions import Mounds, Shelter
 from marsyard.sim.render.rover import rover_objects
-from marsyard.sim.render.skylight import Mounds, Shelter, SkyLight
+from marsyard.sim.render.sky import SkyLight
 from marsyard.sim.sensor.mast import MER_MAST
 from tests.sim.scenes import DOWN, LAMBERT, flat_ground, make_ground
 

@@ -12,7 +12,7 @@ from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Photometry, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.rays import PixelRays
+from marsyard.sim.render.pixel_rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.image_motion import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise

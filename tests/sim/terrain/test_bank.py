@@ -40,15 +40,6 @@ def test_terrain_of_a_single_case_is_not_written(cache: Path) -> None:
     assert not level.flags.owndata
 
 
-def test_cached_terrain_equals_the_built_terrain(cache: Path) -> None:
-    bank = TerrainBank(SMALL, seed=1)
-    expected = _read_bytes(bank, 0)
-    assert len(list(cache.iterdir())) == 1
-    assert _read_bytes(bank, 0) == expected
-    next(cache.iterdir()).unlink()
-    assert _read_bytes(bank, 0) == expected
-
-
 def test_number_seed_and_parameters_identify_a_terrain(cache: Path) -> None:
     terrains = {
         _read_bytes(TerrainBank(SMALL, 1), 0),
@@ -59,28 +50,27 @@ def test_number_seed_and_parameters_identify_a_terrain(cache: Path) -> None:
     assert len(terrains) == 4
 
 
-@pytest.mark.parametrize("damage", [b"", b"not an array", None])
-def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
-    bank = TerrainBank(SMALL, seed=1)
-    expected = _read_bytes(bank, 3)
-    path = next(cache.iterdir())
-    path.write_bytes(path.read_bytes()[:1000] if damage is None else damage)
-    with pytest.warns(CacheWarning, match="damaged and will be rebuilt"):
-        assert _read_bytes(bank, 3) == expected
-    assert _read_bytes(bank, 3) == expected
-
-
-def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
+@pytest.mark.parametrize("damage", ["empty", "another file", "cut", "zeros", "removed"])
+def test_damaged_file_is_rebuilt(cache: Path, damage: str, recwarn: pytest.WarningsRecorder) -> None:
     """A file that this process has already verified is verified again if its modification time has changed."""
     bank = TerrainBank(SMALL, seed=1)
-    expected = _read_bytes(bank, 0)
-    assert _read_bytes(bank, 0) == expected
-    with next(cache.iterdir()).open("r+b") as file:
-        file.seek(5000)
-        file.write(bytes(20_000))
-    with pytest.warns(CacheWarning, match="checksum"):
-        assert _read_bytes(bank, 0) == expected
-    assert _read_bytes(bank, 0) == expected
+    expected = _read_bytes(bank, 3)
+    assert _read_bytes(bank, 3) == expected
+    path = next(cache.iterdir())
+    content = path.read_bytes()
+    if damage == "removed":
+        path.unlink()
+    else:
+        zeroed = content[:5000] + bytes(20_000) + content[25_000:]
+        path.write_bytes(
+            {"empty": b"", "another file": b"not an array", "cut": content[:1000], "zeros": zeroed}[damage]
+        )
+    assert _read_bytes(bank, 3) == expected
+    messages = [str(warning.message) for warning in recwarn if warning.category is CacheWarning]
+    assert len(messages) == (damage != "removed")
+    assert all("damaged and will be rebuilt" in message for message in messages)
+    assert ("checksum" in "".join(messages)) == (damage == "zeros")
+    assert _read_bytes(bank, 3) == expected
 
 
 def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,13 +150,6 @@ def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest
     assert not second & set(cache.iterdir())
     assert _read_bytes(bank, 1) == expected
     assert np.isfinite(terrain_in_use.levels[0]).all()
-
-
-def test_terrain_stays_readable_after_its_file_is_removed(cache: Path) -> None:
-    surface = TerrainBank(SMALL, seed=1).store(0)
-    content = surface.levels[0].tobytes()
-    next(cache.iterdir()).unlink()
-    assert surface.levels[0].tobytes() == content
 
 
 @pytest.mark.slow

@@ -1,16 +1,10 @@
-"""Tests of albedo that follows the ground: strata and their scarps, sand in the lee, worn craters, units on relief."""
-
-from typing import Any
+"""Tests of albedo that follows the ground: strata and their scarps, sand in the lee of relief."""
 
 import numpy as np
 import pytest
 
-from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Drifts, Dunes, Strata, TerrainGround
-from marsyard.sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
-from marsyard.sim.terrain.landforms.deposits import compute_lee
-from marsyard.sim.terrain.landforms.units import SurfaceUnits
-from marsyard.sim.terrain.surface import TEXTURE
+from marsyard.sim.terrain.landforms.wind import compute_lee
 
 SIDE, SPACING_M = 256, 2.0
 
@@ -80,28 +74,3 @@ def test_sand_lies_in_craters_and_behind_rims() -> None:
     change = np.abs(rippled.height - ground.height)
     assert change[radius < 40.0].max() > 0.4
     assert change[radius > 200.0].max() < 0.02
-
-
-def test_large_craters_are_fresher_than_those_in_saturation() -> None:
-    """Diffusion time in units of the squared diameter: uniform below the knee, up to a quarter at twice the knee."""
-    p = TerrainParameters(craters_per_km2=300.0, crater_knee_m=40.0, crater_exponent=1.83)
-    craters = draw_craters(p, np.random.default_rng(3))
-    diameter = 2.0 * craters[:, 2]
-    ratio = (craters[:, 3] + craters[:, 4]) / diameter
-    oldest = FRESH_DEPTH / DEGRADED_DEPTH - 1.0
-    assert np.median(ratio[diameter < 40.0]) == pytest.approx(FRESH_DEPTH / (1.0 + 0.5 * oldest), rel=0.05)
-    assert ratio[diameter > 80.0].min() >= FRESH_DEPTH / (1.0 + 0.25 * oldest)
-
-
-@pytest.mark.parametrize("elevation", [-2.0, 0.0, 2.0])
-def test_borders_of_units_follow_the_relief(elevation: float) -> None:
-    kinds: list[dict[str, Any]] = [
-        {"name": "high", "fraction": 0.5, "texture": 2.0, "elevation": elevation},
-        {"name": "other", "fraction": 0.5, "texture": 1.0},
-    ]
-    p = TerrainParameters(samples=512, spacing_m=4.0, rms_slope_deg=3.0, craters_per_km2=0.0, outer_scale_m=400.0)
-    p = p.model_copy(update={"units": SurfaceUnits.model_validate({"kinds": kinds}), "fine_below_m": 60.0})
-    surface = synthesise(p, np.random.default_rng(4))
-    texture, height = surface.factors[..., TEXTURE].ravel(), surface.levels[0][::4, ::4, 0].ravel()
-    correlation = np.corrcoef(texture, height)[0, 1]
-    assert np.sign(elevation) * correlation > 0.4 if elevation else abs(correlation) < 0.2

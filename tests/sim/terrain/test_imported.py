@@ -9,7 +9,7 @@ import pytest
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
 from marsyard.sim.terrain.imported import choose_grid, embed, fill_holes
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
-from marsyard.sim.terrain.surface import terrain_statistics
+from marsyard.sim.terrain.statistics import terrain_statistics
 
 #: Size of the synthetic elevation model of the tests, in posts (1 m apart in `tile.npz`).
 ROWS, COLUMNS = 90, 110

@@ -13,9 +13,8 @@ from rasterio.transform import Affine
 
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.terrain import TerrainParameters, synthesise
-from marsyard.sim.terrain.geotiff import full_turn
 from marsyard.sim.terrain.imported import embed
-from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, full_turn, read_rasters
 
 RADIUS_M = 3_396_190.0
 #: Mars, equidistant cylindrical about the equator, on a sphere.
@@ -114,13 +113,6 @@ def test_uncovered_part_is_counted_and_keeps_the_synthetic_albedo(tmp_path: Path
     # The surface normalises the mean albedo of the terrain, so that both differ by a factor outside the image.
     np.testing.assert_allclose(ratio[:38], ratio[0], rtol=1e-5)
     assert np.std(ratio[46:70]) > 0.05
-
-
-def test_small_gap_is_counted(tmp_path: Path) -> None:
-    """The image begins 3 m east of the corner of the DTM: 3 of 80 columns of posts are not covered."""
-    source = make_source(tmp_path, west=EAST_M + 3.0)
-    check_source(source)
-    assert embed(source, 128, 1.0).extent.ortho_holes == 3 * ROWS * 4
 
 
 @pytest.mark.parametrize("pixels", [(0, 0), (2, 4)])
@@ -239,14 +231,6 @@ def test_colours_become_luminance(tmp_path: Path, dtype: str, alpha: bool) -> No
     luminances = 0.299 * 200 + 0.587 * 30 + 0.114 * 5, 0.299 * 10 + 0.587 * 20 + 0.114 * 250
     np.testing.assert_allclose(ortho.values[0, [0, -1]], luminances)
     assert np.count_nonzero(np.isnan(ortho.values)) == (4 * 2 * COLUMNS if alpha else 0)
-
-
-def test_grey_with_alpha_is_valid(tmp_path: Path) -> None:
-    opacity = np.where(np.arange(2 * COLUMNS) < 10, 0, 255) + 0 * BRIGHTNESS
-    bands = np.array([BRIGHTNESS, opacity]).astype(np.uint8)
-    source = make_source(tmp_path, bands, alpha="yes")
-    check_source(source)
-    assert embed(source, 128, 1.0).extent.ortho_holes == 10 * 2 * ROWS
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.landforms import Outcrop, TerrainGround
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, locate_points
+from marsyard.sim.terrain.landforms.bedrock import locate_points
+from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs
 
 
 def _apply(**changes: float) -> TerrainGround:
@@ -88,9 +88,3 @@ def test_joints_differ_in_width() -> None:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
         widths += (edges[1::2] - edges[::2]).tolist()
     assert np.std(widths) > 0.5 * np.mean(widths)
-
-
-def test_outcrop_is_a_landform_of_a_terrain() -> None:
-    parameters = TerrainParameters.model_validate({"samples": 64, "outcrop": {"fraction": 0.5}})
-    assert parameters.outcrop == Outcrop(fraction=0.5)
-    assert parameters.with_changes({"outcrop": None}).outcrop is None

@@ -3,25 +3,11 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydantic import ValidationError
 from scipy.ndimage import map_coordinates
 
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
-from marsyard.sim.terrain.landforms.craters import (
-    DEGRADED_DEPTH,
-    EJECTA_EXTENT_RADII,
-    EJECTA_OPACITY,
-    FILL_MARGIN,
-    FRESH_DEPTH,
-    OUTLINE_EXPONENT,
-    OUTLINE_RMS,
-    add_craters,
-    draw_craters,
-    outline_tables,
-)
-from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels.shapes import stamp_craters
+from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +31,6 @@ def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarr
         control = surface.levels[level][..., channel].astype(np.float64)
         expected = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
         assert_allclose(actual, expected, atol=1e-12)
-
-
-#: Tables of a round outline without rays.
-ROUND = (np.zeros((1, 4)), np.zeros((1, 4)))
-#: Last columns of a crater whose albedo does not wear: extent and opacity of ejecta, margin of the fill, deposit.
-NO_WEAR = (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)
 
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
@@ -79,11 +59,6 @@ def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
         assert ceiling[row, column] == samples[np.ix_(*indices)].max()
 
 
-def test_surface_is_periodic(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
-    x, y = positions
-    assert_allclose(surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11)
-
-
 def test_resolution_levels_are_aligned() -> None:
     """A long wave has the same phase on each level."""
     side, spacing = 256, 2.0
@@ -103,16 +78,6 @@ def test_resolution_levels_are_aligned() -> None:
 def test_shapes_that_cannot_be_halved_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="power of two"):
         Surface.from_samples(np.zeros(shape, dtype=np.float32), 1.0)
-
-
-def test_equal_seeds_produce_equal_bytes() -> None:
-    parameters = TerrainParameters(samples=128)
-    first = synthesise(parameters, np.random.default_rng(3))
-    same_seed = synthesise(parameters, np.random.default_rng(3))
-    other_seed = synthesise(parameters, np.random.default_rng(4))
-    for level, same_level in zip(first.levels, same_seed.levels, strict=True):
-        assert level.tobytes() == same_level.tobytes()
-    assert first.levels[0].tobytes() != other_seed.levels[0].tobytes()
 
 
 def test_random_fields_have_the_specified_mean_variance() -> None:
@@ -172,100 +137,3 @@ def test_white_noise_replaces_the_finest_octave(hurst: float) -> None:
         assert power[0][ring].sum() == pytest.approx(power[1][ring].sum(), rel=tolerance)
     rms_slopes = [field.line_slope_rms(30.0) for field in fields]
     assert rms_slopes[0] == pytest.approx(rms_slopes[1], rel=0.02)
-
-
-def test_large_craters_are_equal_on_a_coarser_grid() -> None:
-    """A crater with a radius of 150 samples, on a grid of every fourth sample: equal within 2 % of its depth."""
-    shape = (512, 512)
-    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(4), *NO_WEAR]])
-    height, log_albedo = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    stamp_craters(height, log_albedo, 1.0, crater, *outline_tables())
-    ground = TerrainGround(np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32), 1.0)
-    add_craters(ground, crater)
-    # the B-spline of the coarser grid smooths the crest over a sample
-    assert np.sqrt(np.mean((ground.height - height) ** 2)) < 0.01 * 24.0
-    assert np.abs(ground.height - height).max() < 0.05 * 24.0
-    assert np.sqrt(np.mean((ground.log_albedo - log_albedo) ** 2)) < 0.01
-
-
-def test_crater_sizes_follow_the_power_law() -> None:
-    parameters = TerrainParameters(craters_per_km2=200.0, crater_diameter_min_m=10.0, crater_exponent=2.0)
-    area_km2 = (parameters.samples * parameters.spacing_m / 1000.0) ** 2
-    diameters = 2 * draw_craters(parameters, np.random.default_rng(2))[:, 2]
-    expected = 200.0 * area_km2
-    assert diameters.size == pytest.approx(expected, abs=4 * np.sqrt(expected))
-    # With an exponent of 2, a quarter of the craters have twice the minimum diameter.
-    large_craters = np.count_nonzero(diameters > 20.0)
-    assert large_craters == pytest.approx(expected / 4, abs=4 * np.sqrt(expected / 4))
-    assert diameters.min() >= 10.0
-    assert diameters.max() <= parameters.crater_diameter_max_m
-
-
-def test_crater_depths_range_from_degraded_to_fresh() -> None:
-    craters = draw_craters(TerrainParameters(craters_per_km2=100.0), np.random.default_rng(3))
-    depth_ratio = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
-    assert depth_ratio.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
-    assert depth_ratio.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
-
-
-def test_outlines_have_a_power_law_of_waves() -> None:
-    """Large craters are scalloped, not polygons: the power of the waves follows the law, and no wave is the shape."""
-    height, log_albedo = np.zeros((512, 512), dtype=np.float32), np.zeros((512, 512), dtype=np.float32)
-    azimuth = 2.0 * np.pi * np.arange(256) / 256
-    powers = []
-    for number in range(32):
-        height[:] = 0.0
-        crater = [256.0, 256.0, 80.0, 16.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, number, 0.1, *NO_WEAR]
-        stamp_craters(height, log_albedo, 1.0, np.array([crater]), *outline_tables())
-        # without a rim, the bowl ends at the outline: it is at half its depth at 0.5**(1 / 2.2) of the local radius
-        radii = np.arange(20.0, 80.0, 0.25)
-        rays = [256.0 + radii[:, None] * shape(azimuth) for shape in (np.sin, np.cos)]
-        profile = map_coordinates(height, rays, order=1)
-        outline = radii[np.argmax(profile > -8.0, axis=0)] / (80.0 * 0.5 ** (1.0 / 2.2))
-        powers.append(np.abs(np.fft.rfft(outline - 1.0) / 256) ** 2)
-    power = np.mean(powers, axis=0)
-    assert np.sqrt(2.0 * power[1:].sum()) == pytest.approx(OUTLINE_RMS, rel=0.1)
-    waves = np.arange(2, 10)
-    exponent = np.polyfit(np.log(waves), np.log(power[waves]), 1)[0]
-    assert exponent == pytest.approx(2.0 * OUTLINE_EXPONENT, abs=0.4)
-    # five lobes alone, a pentagon, have a small fraction of the variance
-    assert power[5] < 0.1 * power[1:].sum()
-
-
-def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
-    height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
-    radius, depth, rim = 20.0, 6.4, 1.6
-    # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
-    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(4), *NO_WEAR]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND)
-    centred = np.roll(height, (128, 128), axis=(0, 1))
-    assert centred[128, 128] == pytest.approx(-depth)
-    assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
-    assert centred[128, 128 + 20] == pytest.approx(rim)
-    assert centred[128 - 20, 128] == pytest.approx(rim)
-    assert np.count_nonzero(centred[:, :60]) == 0
-    # the ejecta cover the bowl: 95 % at the rim, more inside
-    assert np.roll(log_albedo, 128, axis=1)[0, 128] == pytest.approx(0.1, rel=1e-4)
-    assert np.roll(log_albedo, 128, axis=1)[0, 148] == pytest.approx(0.1 * (1.0 - np.exp(-EJECTA_OPACITY)), rel=0.02)
-
-
-def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
-    height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
-    # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(4), *NO_WEAR]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND)
-    assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
-    assert np.ptp(height[64, 56:73]) < 0.15
-    assert not log_albedo.any()
-
-
-def test_unordered_crater_sizes_are_rejected() -> None:
-    parameters = TerrainParameters(samples=64, crater_diameter_min_m=50.0, crater_diameter_max_m=20.0)
-    with pytest.raises(ValueError, match="must be larger than crater_diameter_min_m"):
-        synthesise(parameters, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("invalid", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
-def test_invalid_parameters_are_rejected(invalid: dict[str, float]) -> None:
-    with pytest.raises(ValidationError):
-        TerrainParameters.model_validate(invalid)

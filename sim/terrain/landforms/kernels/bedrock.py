@@ -11,27 +11,12 @@ from marsyard.sim.terrain.kernels import Array
 from marsyard.sim.terrain.landforms.kernels.shapes import Grid
 
 
-@njit(cache=True)
-def locate_points(points: Array) -> Array:
-    """Positions of the points of a periodic grid in units of its squares, with a margin of one square.
-
-    `points` contains the position of each point within its square, from 0 to 1, shape (count, count, 2).
-    """
-    count = points.shape[0]
-    positions = np.empty((count + 2, count + 2, 2))
-    for row in range(-1, count + 1):
-        for column in range(-1, count + 1):
-            x, y = points[row % count, column % count]
-            positions[row + 1, column + 1, 0], positions[row + 1, column + 1, 1] = column + x, row + y
-    return positions
-
-
 @njit(cache=True, error_model="numpy")
 def _find_cells(positions: Array, x: float, y: float) -> tuple[int, int, int, int, float, float, float]:
     """Find the Voronoi cells next to x, y: rows and columns of the two nearest points in `positions`, and the border.
 
     Returns also the offset of the nearest point, before the distance to the border. `positions` are those of
-    `locate_points`. Lengths are in units of its squares.
+    `add_cracks`. Lengths are in units of its squares.
     """
     row, column = int(y), int(x)
     nearest2, second2, nearest, second = 1e9, 1e9, 0, 0
@@ -55,7 +40,7 @@ def add_cracks(
     height: Grid,
     log_albedo: Grid,
     spacing: float,
-    points: Array,
+    positions: Array,
     cell: float,
     width: float,
     depth: float,
@@ -63,12 +48,11 @@ def add_cracks(
 ) -> None:
     """Add polygonal cracks along the borders of Voronoi cells, with one point in each square of a periodic grid.
 
-    - points: position of each point within its square, from 0 to 1, shape (count, count, 2)
+    - positions: of the points, in units of the squares, with a margin of one square: shape (count + 2, count + 2, 2)
     - cell: side of a square, metres
     - width, depth: half width over which a crack fades, and depth at its middle, metres
     - contrast: change of the logarithm of albedo at the middle of a crack
     """
-    positions = locate_points(points)
     for i in range(height.shape[0]):
         for j in range(height.shape[0]):
             border = _find_cells(positions, j * spacing / cell, i * spacing / cell)[6] * cell
@@ -81,7 +65,7 @@ def add_cracks(
 class Slabs(NamedTuple):
     """Slabs of one generation of joints: Voronoi cells with one point in each square of a periodic grid.
 
-    - positions: of the points, those of `locate_points`
+    - positions: of the points, as in `add_cracks`
     - slabs: height at the point, slopes along x and y, logarithm of albedo, and a random number from 0 to 1 of each
       cell, with a margin like the positions, shape (count + 2, count + 2, 5). The numbers of two cells give the width
       of the joint between them

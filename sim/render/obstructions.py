@@ -1,8 +1,8 @@
-"""Light of the sky on surfaces: brighter towards the sun and the horizon, and hidden by rocks and by a rover.
+"""Bodies that hide a part of the sky: rocks, as half spheroids on the ground, and the body of a rover above it.
 
-Irradiances are divided by pi. The sky above level ground has the radiance ``D (a + g . w)`` in the direction w. Bodies
-hide a part of it: their vector ``B = 1 / pi int w d(solid angle)`` over the directions that they cover is known in
-closed form for a mound and for a convex body, so a surface with the unit normal n loses ``n . B`` of a uniform sky.
+Their vector ``B = 1 / pi int w d(solid angle)`` over the directions w that they cover is known in closed form for a
+mound and for a convex body. A surface with the unit normal n loses ``n . B`` of the irradiance (divided by pi) of a
+uniform sky.
 """
 
 from __future__ import annotations
@@ -28,42 +28,6 @@ _MOUNDS_PER_CELL, _MAX_CELLS = 1.0, 512
 #: Faces of a shelter, counter-clockwise seen from outside: bottom, top, and the sides i from corner i to corner i + 1.
 _FACES = ((0, 3, 2), (4, 5, 6), (0, 1, 5), (1, 2, 6), (2, 3, 7), (3, 0, 4))
 _BOTTOM, _TOP, _FIRST_SIDE = 0, 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class SkyLight:
-    """Diffuse light: irradiance D of level ground; radiance a, and its gradient g, of a sky with the irradiance 1."""
-
-    level: Values
-    base: Values
-    gradient: Values
-
-    @classmethod
-    def of(cls, level: float, mean_radiance: float, towards_sun: float, sun: FloatArray[np.ndarray, "3"]) -> SkyLight:
-        """Fit the linear sky to moments of a sky with the irradiance 1.
-
-        - mean_radiance: mean of the radiance over the hemisphere; above 1 if the horizon is brighter than the zenith
-        - towards_sun: horizontal component, towards the sun, of ``1 / pi int L w d(solid angle)``
-        """
-        horizontal = sun[:2] / max(float(np.hypot(*sun[:2])), 1e-9)
-        # the radiance at the zenith, a + g_z = 1 + g_z / 3, is not negative
-        upwards = max(6.0 * (1.0 - mean_radiance), -3.0)
-        gradient = [*(1.5 * towards_sun * horizontal).tolist(), upwards]
-        return cls(Float(level), Float(1.0 - 2.0 / 3.0 * upwards), Array3f(*gradient))
-
-    def irradiance(self, normal: Values, blocked: Values) -> Values:
-        """Irradiance of surfaces with unit normals, of whose sky the vectors `blocked` are hidden.
-
-        Exact for the linear sky above a horizontal horizon: the sky that a surface sees is a lune with the angle pi -
-        acos(n_z).
-        """
-        cosine = clip(normal.z, -1.0, 1.0)
-        tilt, sine = dr.acos(cosine) / dr.pi, dr.sqrt(1.0 - cosine * cosine) / dr.pi
-        gradient = dr.fma(1.0 - tilt, dr.dot(self.gradient, normal), sine * self.gradient.z)
-        visible = dr.fma(0.5 * self.base, 1.0 + cosine, 2.0 / 3.0 * gradient)
-        direction = blocked / larger(dr.norm(blocked), 1e-6)
-        radiance = larger(self.base + dr.dot(self.gradient, direction), 0.0)
-        return self.level * larger(dr.fma(-radiance, larger(dr.dot(normal, blocked), 0.0), visible), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,15 +1,17 @@
-"""Outcrops of bedrock: polygonal slabs between joints, with sand in the gaps, as at Meridiani and in Jezero."""
+"""Bedrock: level layers that end in scarps, and patches of polygonal slabs between joints with sand in the gaps."""
 
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float64
 from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, locate_points
+from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, expose_strata
 
+_ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.
 #: Sizes of the slabs of the two generations of joints, relative to the parameter, and their relative heights (assumed).
 _SIZES, _HEIGHTS = (1.0, 0.37), (1.0, 0.4)
 #: Range of a slab's height around the mean, and depth of joints, in heights of the slabs; rise of the bedrock from its
@@ -19,6 +21,39 @@ _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: the joints in sizes; height above the sand over which dust covers a slab, in heights; fraction of the large slabs
 #: that the second generation divides (assumed).
 _SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.35, 0.6
+
+
+class Strata(Parameters):
+    """Level layers of different brightness, which end in scarps where the ground cuts them.
+
+    A stratum has a gently sloping tread and a steep scarp: the fraction `scarp_height` of its thickness is compressed
+    to the fraction `scarp_width` of its outcrop. Thicknesses have a gamma distribution with the shape 3 (assumed).
+    """
+
+    thickness_m: Annotated[Positive, Field(description="mean thickness, m")] = 15.0
+    log_albedo_rms: Annotated[Fraction, Field(description="RMS of the strata's log albedo")] = 0.08
+    scarp_height: Annotated[Fraction, Field(description="fraction of the thickness that is in the scarp")] = 0.6
+    scarp_width: Annotated[float, Field(gt=0.0, le=1.0, description="fraction of the outcrop that is the scarp")] = 0.2
+    scarp_log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of scarps / of their strata)")] = 0.0
+
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
+        """Replace the heights by those of treads and scarps, and add the albedo of the strata."""
+        lowest, highest = float(ground.height.min()), float(ground.height.max())
+        count = int(2.0 * (highest - lowest) / self.thickness_m) + 8
+        thickness = self.thickness_m * rng.gamma(3.0, 1.0 / 3.0, count)
+        base = lowest - rng.uniform(0.0, thickness[0]) + np.concatenate([[0.0], np.cumsum(thickness)])
+        log_albedo = self.log_albedo_rms * rng.standard_normal(count)
+        rows = int((highest - lowest) / self.thickness_m * _ROWS_PER_STRATUM) + 2
+        height = np.linspace(lowest, highest, rows)
+        stratum = np.clip(np.searchsorted(base, height, side="right") - 1, 0, count - 1)
+        fraction = (height - base[stratum]) / thickness[stratum]
+        # the scarp is the lower end of a stratum's outcrop
+        knots = [0.0, self.scarp_width, 1.0]
+        exposed = base[stratum] + thickness[stratum] * np.interp(fraction, knots, [0.0, self.scarp_height, 1.0])
+        scarp = self.scarp_log_albedo * (fraction < self.scarp_width)
+        table = np.column_stack([exposed, log_albedo[stratum] + scarp])
+        step = (highest - lowest) / (rows - 1) if highest > lowest else 1.0
+        expose_strata(ground.height, ground.log_albedo, lowest, step, table)
 
 
 class Outcrop(Parameters):
@@ -86,3 +121,13 @@ class Outcrop(Parameters):
         return Slabs(
             positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), period_m / cells, joint, depth, rise
         )
+
+
+def locate_points(points: Float64[np.ndarray, "count count 2"]) -> Float64[np.ndarray, "margin margin 2"]:
+    """Return the positions of the points of a periodic grid in units of its squares, with a margin of one square.
+
+    `points` contains the position of each point within its square, from 0 to 1; rows are along y.
+    """
+    squares = np.arange(-1.0, len(points) + 1.0)
+    corners = np.stack(np.meshgrid(squares, squares), axis=-1)
+    return np.asarray(np.pad(points, ((1, 1), (1, 1), (0, 0)), mode="wrap") + corners)

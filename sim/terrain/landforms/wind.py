@@ -1,4 +1,4 @@
-"""Albedo that follows the ground: layers of rock that relief exposes, and sand that the wind leaves in its lee."""
+"""Landforms of the wind: dunes and ripples, and sand in the lee of relief."""
 
 from typing import Annotated
 
@@ -7,45 +7,58 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import expose_strata
-from marsyard.sim.terrain.landforms.kernels.shapes import cast_lee
-from marsyard.sim.terrain.landforms.relief import Dunes
+from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, draw_smooth_fields, resample
+from marsyard.sim.terrain.landforms.kernels.wind import Bedforms, add_dunes, cast_lee
 
-_ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.
+SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 
 
-class Strata(Parameters):
-    """Level layers of different brightness, which end in scarps where the ground cuts them.
+class Dunes(Parameters):
+    """A train of transverse bedforms: a gentle windward slope, and a leeward slip face with an apron at its foot.
 
-    A stratum has a gently sloping tread and a steep scarp: the fraction `scarp_height` of its thickness is compressed
-    to the fraction `scarp_width` of its outcrop. Thicknesses have a gamma distribution with the shape 3 (assumed).
+    Dunes and ripples differ in size. Wind ripples do not avalanche: their lee slope is about 20 deg (Sharp 1963). The
+    slip face of a dune has the angle of repose, 30-34 deg for dry sand (Bagnold 1941). Crests wander and end in
+    defects, as in interacting bedforms of different wavelengths (Werner & Kocurek 1999).
     """
 
-    thickness_m: Annotated[Positive, Field(description="mean thickness, m")] = 15.0
-    log_albedo_rms: Annotated[Fraction, Field(description="RMS of the strata's log albedo")] = 0.08
-    scarp_height: Annotated[Fraction, Field(description="fraction of the thickness that is in the scarp")] = 0.6
-    scarp_width: Annotated[float, Field(gt=0.0, le=1.0, description="fraction of the outcrop that is the scarp")] = 0.2
-    scarp_log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of scarps / of their strata)")] = 0.0
+    wavelength_m: Annotated[Positive, Field(description="distance from crest to crest, m")] = 110.0
+    height_m: Annotated[Positive, Field(description="RMS height of crest over trough, m")] = 5.0
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 270.0
+    repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
+    crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
+    regularity: Annotated[
+        float, Field(ge=0.3, le=20.0, description="length over which the spacing persists, wavelengths")
+    ] = 1.5
+    albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
-        """Replace the heights by those of treads and scarps, and add the albedo of the strata."""
-        lowest, highest = float(ground.height.min()), float(ground.height.max())
-        count = int(2.0 * (highest - lowest) / self.thickness_m) + 8
-        thickness = self.thickness_m * rng.gamma(3.0, 1.0 / 3.0, count)
-        base = lowest - rng.uniform(0.0, thickness[0]) + np.concatenate([[0.0], np.cumsum(thickness)])
-        log_albedo = self.log_albedo_rms * rng.standard_normal(count)
-        rows = int((highest - lowest) / self.thickness_m * _ROWS_PER_STRATUM) + 2
-        height = np.linspace(lowest, highest, rows)
-        stratum = np.clip(np.searchsorted(base, height, side="right") - 1, 0, count - 1)
-        fraction = (height - base[stratum]) / thickness[stratum]
-        # the scarp is the lower end of a stratum's outcrop
-        knots = [0.0, self.scarp_width, 1.0]
-        exposed = base[stratum] + thickness[stratum] * np.interp(fraction, knots, [0.0, self.scarp_height, 1.0])
-        scarp = self.scarp_log_albedo * (fraction < self.scarp_width)
-        table = np.column_stack([exposed, log_albedo[stratum] + scarp])
-        step = (highest - lowest) / (rows - 1) if highest > lowest else 1.0
-        expose_strata(ground.height, ground.log_albedo, lowest, step, table)
+        """Add the dunes."""
+        ground.add(self.create_layer(ground, rng))
+
+    def create_layer(self, ground: TerrainGround, rng: Generator) -> TerrainGround:
+        """Create the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
+        # the wave vector points downwind; azimuth is clockwise from north, x is east
+        downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
+        waves_per_side = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
+        whole_waves = np.round(waves_per_side)
+        if not whole_waves.any():
+            side = f"{ground.period_m:g} m"
+            raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
+        wave_vector = 2.0 * np.pi * whole_waves / ground.period_m
+        # amplitudes of the fields fall to 1/e at the wavenumber 2 / length
+        across_m, along_m = (
+            length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity)
+        )
+        modulation = draw_smooth_fields(ground.period_m, across_m, along_m, float(downwind), rng)
+        step = max(modulation.shape[0] // ground.side, 1)
+        modulation = np.ascontiguousarray(modulation[::step, ::step])
+        max_slope = float(np.tan(np.radians(self.repose_deg)))
+        slip_face_m = self.height_m / max_slope
+        layer = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
+        kx, ky = (float(wavenumber) for wavenumber in wave_vector)
+        bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
+        add_dunes(layer.height, layer.log_albedo, layer.spacing_m, modulation, bedforms)
+        return layer
 
 
 class Drifts(Parameters):
