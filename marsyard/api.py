@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.definition import loading
-from marsyard.campaigns.definition.algorithm_replacement import replace_algorithms
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.scenarios import systems
@@ -132,7 +131,7 @@ def run(
     if compare and algorithm is None:
         raise CampaignError("compare needs an algorithm under test: the argument 'algorithm'")
     if isinstance(campaign, Campaign):
-        selected = replace_algorithms(campaign, specs)
+        selected = loading.replace_algorithms(campaign, specs)
     else:
         selected = load_campaign(campaign, changes, cases=cases, seed=seed, algorithms=specs)
     run_campaign(selected, folder, jobs=jobs)
@@ -186,8 +185,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import evaluate_and_store
-    from marsyard.cli.progress import campaign_progress
-    from marsyard.cli.run_log import RunLog
+    from marsyard.cli.progress import RunLog, campaign_progress
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
@@ -198,11 +196,16 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
 def results(directory: str | Path) -> pd.DataFrame:
     """Return the stored results of a campaign: outcome, errors and drawn values, one row per case."""
-    from marsyard.campaigns.store.table import refresh_table
-    from marsyard.cli.outcome import read_frame
+    import pandas as pd
+
+    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
+    from marsyard.sim.files import report_damage
 
     refresh_table(Path(directory))
-    return read_frame(Path(directory))
+    path = Path(directory) / TABLE_FILE
+    with report_damage(path, StoreError, "is not a valid table of cases"):
+        return pd.read_parquet(path)
 
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
@@ -229,8 +232,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - pose: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.image_request import ImageRequest
-    from marsyard.site_images import render_images
+    from marsyard.site_images import ImageRequest, render_images
 
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 

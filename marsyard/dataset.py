@@ -21,6 +21,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import definition_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.shared_inputs import plan_inputs
+from marsyard.image_files import encode_image
 from marsyard.scenarios.image_samples import ProvidesSamples
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
@@ -128,9 +129,4 @@ def _encode(values: np.ndarray[Any, Any]) -> bytes:
         buffer = io.BytesIO()
         np.save(buffer, values, allow_pickle=False)
         return buffer.getvalue()
-    import cv2
-
-    is_encoded, png = cv2.imencode(".png", values)
-    if not is_encoded:
-        raise ValueError("an image could not be encoded as PNG")
-    return png.tobytes()
+    return encode_image(".png", values)

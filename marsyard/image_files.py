@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,12 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from marsyard.image_request import ImageRequest
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.site_images import FULL_SCALE_RADIANCE_FACTOR, RenderedImage
+from marsyard.site_images import FULL_SCALE_RADIANCE_FACTOR, ImageRequest, RenderedImage
 
 #: Files of an image: 16-bit image, truth layers, camera model, and metadata.
 SUFFIXES = (".png", ".npz", ".cahvor", ".json")
@@ -51,10 +51,7 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
 def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
     """Write the files of an image (see `SUFFIXES`); return their paths."""
     png, npz, cahvor, metadata = (_build_path(prefix, image.suffix, ending) for ending in SUFFIXES)
-    is_encoded, png_bytes = cv2.imencode(".png", image.to_uint16())
-    if not is_encoded:
-        raise ValueError(f"{png} could not be encoded")
-    png.write_bytes(png_bytes.tobytes())
+    png.write_bytes(encode_image(".png", image.to_uint16()))
     with npz.open("wb") as file:
         np.savez(file, **truth_layers(image))
     write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
@@ -121,3 +118,11 @@ def check_files(prefix: Path, camera: str, overwrite: bool) -> None:
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:
         raise ValueError(f"{', '.join(existing)}: files exist; use --overwrite to replace them")
+
+
+def encode_image(extension: str, image: np.ndarray, options: Sequence[int] = ()) -> bytes:
+    """Encode an image in the format of a file extension, with options of OpenCV. Raises ValueError on failure."""
+    is_encoded, buffer = cv2.imencode(extension, image, options)
+    if not is_encoded:
+        raise ValueError(f"an image could not be encoded as {extension}")
+    return buffer.tobytes()

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from marsyard.campaigns.errors import CampaignError, unknown_name_message
-from marsyard.campaigns.store.packed_products import save_packed
-from marsyard.campaigns.store.products import case_directory
+from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.table import refresh_table
 from marsyard.reports import campaign_diff, figures
 from marsyard.reports.column_selection import primary_metric

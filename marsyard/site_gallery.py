@@ -13,10 +13,10 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float64, UInt8
 
-from marsyard.image_request import ImageRequest
+from marsyard.image_files import encode_image
 from marsyard.reports.page_environment import page_environment
 from marsyard.scenarios.terrain_files import SUFFIXES, is_terrain_file, load_site
-from marsyard.site_images import render_images
+from marsyard.site_images import ImageRequest, render_images
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 
@@ -176,11 +176,3 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         if len(png) <= SHEET_BYTES:
             break
     return png
-
-
-def encode_image(extension: str, grey: Grey, options: Sequence[int]) -> bytes:
-    """Encode an image in the format of a file extension. Raises ValueError if OpenCV cannot encode it."""
-    is_encoded, buffer = cv2.imencode(extension, grey, options)
-    if not is_encoded:
-        raise ValueError(f"an image could not be encoded as {extension}")
-    return buffer.tobytes()

@@ -10,12 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.claims import requirement_key
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import Confirmation, requirement_key
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.confirmation_record import find_own_entry, is_variant, list_related_claims, read_record
-from marsyard.campaigns.store.git_registration import UNKNOWN, find_registration_problem
+from marsyard.campaigns.store.git_history import UNKNOWN, find_registration_problem
 from marsyard.reports.case_evidence import RequirementEvidence
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count

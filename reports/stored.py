@@ -10,7 +10,7 @@ import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.origin import check_rows
-from marsyard.campaigns.store.packed_products import load_products
+from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.campaigns.store.table import check_table
 from marsyard.reports.column_selection import axis_columns, driver_columns, looks_like_condition, primary_metric

@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import Confirmation
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import NOTHING, percent, requirement_text
 

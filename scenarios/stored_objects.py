@@ -13,8 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
-
 #: Ending of a stored object.
 SUFFIX = ".pkl"
 #: Digits of the hash in the name of a stored object.
@@ -54,6 +52,8 @@ def name_object(value: Any, folder: Path) -> str:
     """
     if isinstance(value, str):
         return value
+    import cloudpickle  # here and below, so that `marsyard list` starts fast
+
     if inspect.isfunction(value) and _has_required_parameters(value):
         stored: Any = StoredInstance(FunctionEstimator(value))
     elif isinstance(value, type) or inspect.isfunction(value):
@@ -80,6 +80,8 @@ def name_object(value: Any, folder: Path) -> str:
 
 def load_object(path: str) -> Any:
     """Load a stored class, function or factory. Raises ImportError with the reason."""
+    import cloudpickle
+
     try:
         return cloudpickle.loads(Path(path).read_bytes())
     except Exception as error:  # the modules of the object may raise anything

@@ -43,8 +43,9 @@ def _set_numba_folder() -> None:
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())
-    sources = (path for folder in _FOLDERS for path in (root / folder).rglob("*.py"))
-    for source in sorted(path for path in sources if "kernels" in (path.stem, path.parent.name)):
+    folders = (Path(path) for folder in _FOLDERS for path, *_ in os.walk(root / folder))
+    patterns = ((folder, "*.py" if folder.name == "kernels" else "kernels.py") for folder in folders)
+    for source in sorted(path for folder, pattern in patterns for path in folder.glob(pattern)):
         digest.update(source.read_bytes())
     try:
         folder = cache_directory("kernels") / digest.hexdigest()[:16]

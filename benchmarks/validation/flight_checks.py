@@ -22,11 +22,10 @@ from benchmarks.validation.image_statistics import (
 )
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes.products import TRACK_COLUMNS
-from marsyard.image_request import ImageRequest
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.sim.sensor import preset
-from marsyard.site_images import render_images
+from marsyard.site_images import ImageRequest, render_images
 
 #: Altitudes of two of Spirit's descent images, metres.
 ALTITUDES_M = (1433.0, 1983.0)

@@ -19,10 +19,9 @@ from benchmarks.validation.image_statistics import (
 )
 from benchmarks.validation.records import Check, Measure
 from marsyard.image_files import truth_layers
-from marsyard.image_request import ImageRequest
 from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.terrain import sites
-from marsyard.site_images import RenderedImage, render_images
+from marsyard.site_images import ImageRequest, RenderedImage, render_images
 
 #: Side of the crops of ground, pixels, and angles of their upper edge below the horizon, degrees. With 384 pixels of
 #: 0.047 deg a crop of a mast image ends at 25 deg.

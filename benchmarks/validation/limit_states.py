@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
+from marsyard.campaigns.sampling.study_points import NEW_STREAM
+from marsyard.campaigns.studies.subset import Evaluated, SubsetResult, subset_simulation
 from marsyard.sim.streams import Blend
 
 #: Default probability below which a simulation stops, which no simulation reaches.

@@ -38,6 +38,7 @@ class Campaign:
     - definition: contents of the campaign file, changed by command-line options, with complete parameters
     - scenario: scenario of the campaign's cases
     - command: words of the command that repeats the campaign; empty if no command started it
+    - file: campaign file; None if the campaign was created or loaded from a record
     - confirms: whether the run is a confirmation (`marsyard.campaigns.definition.evidence`)
     - confirmations: record of confirmations
     - calibration_overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
@@ -46,6 +47,7 @@ class Campaign:
     definition: CampaignDefinition
     scenario: Scenario
     command: tuple[str, ...] = ()
+    file: Path | None = None
     confirms: bool = False
     confirmations: Path = Path(CONFIRMATIONS_FILE)
     calibration_overlap: float | None = None

@@ -1,5 +1,6 @@
 """Select the executor of a campaign: processes on this machine, or a cluster."""
 
+import os
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -31,3 +32,8 @@ def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
     Raises CampaignError if the cluster cannot be reached or Dask is not installed.
     """
     return LocalExecutor(config.jobs) if config.cluster is None else ClusterExecutor(config.cluster)
+
+
+def available_cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

@@ -7,7 +7,9 @@ twenty times per second, and terminates a worker whose case exceeds a limit
 """
 
 import fcntl
+import math
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -23,7 +25,6 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import Batches
-from marsyard.campaigns.execution.machine_resources import free_memory
 from marsyard.campaigns.execution.monitoring import POLL_INTERVAL_S, MonitoredWorker
 from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.execution.worker_process import BatchResult
@@ -54,7 +55,7 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
     """
 
     def __init__(self, jobs: int, executors: int = 1) -> None:
-        self._default_memory_bytes = _MEMORY_FRACTION * free_memory() / (jobs * executors)
+        self._default_memory_bytes = _MEMORY_FRACTION * _free_memory() / (jobs * executors)
         try:
             _remove_abandoned_folders()
             self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
@@ -218,3 +219,13 @@ def _remove_abandoned_folders() -> None:
                 shutil.rmtree(lock.parent, ignore_errors=True)
             finally:
                 os.close(descriptor)
+
+
+def _free_memory() -> float:
+    """Return the available memory in bytes; infinite if the operating system does not report it."""
+    try:
+        text = Path("/proc/meminfo").read_text()
+    except OSError:
+        return math.inf
+    match = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
+    return float(match[1]) * 1024.0 if match else math.inf

@@ -26,17 +26,15 @@ from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
 from marsyard.campaigns.running.shared_inputs import prepare_inputs
-from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+from marsyard.campaigns.running.stored_campaign import create_files, load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
-from marsyard.campaigns.store.lock import folder_lock
-from marsyard.campaigns.store.new_folder import claim_folder
-from marsyard.campaigns.store.origin import check_rows, describe_origin
-from marsyard.campaigns.store.product_selection import create_product_selection
+from marsyard.campaigns.store.confirmations import extend_confirmation
+from marsyard.campaigns.store.lock import folder_lock, lock_new_folder
+from marsyard.campaigns.store.origin import check_rows
+from marsyard.campaigns.store.product_selection import create_product_selection, find_showcase, find_worst_cases
 from marsyard.campaigns.store.products import ProductStore
-from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.showcase import find_showcase, find_worst_cases
+from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore
 from marsyard.campaigns.store.table import TABLE_FILE, is_current, numeric_metrics, write_table
 from marsyard.scenarios.columns import Columns
 from marsyard.scenarios.declared_columns import row_columns
@@ -75,25 +73,8 @@ def run_campaign(
     Raises CampaignError if the folder contains a campaign or is not writable, or a column of a requirement is missing.
     On KeyboardInterrupt, rows and record are stored before the exception is raised again.
     """
-    claim_folder(directory)
-    with folder_lock(directory):
-        # again, because another process may have started a campaign in the folder before the lock
-        claim_folder(directory)
-        identity = create_identity(campaign.definition)
-        algorithms = describe_algorithms(campaign)
-        create_store(directory / ROWS_FILE, {"identity": identity.definition})
-        command, definition = campaign.command, campaign.definition
-        evidence = reserve_confirmation(campaign, directory) if campaign.confirms else classify_run(campaign)
-        record.write_first_record(
-            directory,
-            definition,
-            identity,
-            executor.describe(),
-            command=command,
-            algorithms=algorithms,
-            evidence=evidence.to_table(),
-            origin=describe_origin(definition),
-        )
+    with lock_new_folder(directory):
+        create_files(campaign, directory, executor)
         if shard is not None:
             record.update(directory, {SHARD_KEY: str(shard)})
         with RowStore(directory / ROWS_FILE) as store:

@@ -15,8 +15,8 @@ from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import check_rows
-from marsyard.campaigns.store.packed_products import PackedProducts
 from marsyard.campaigns.store.product_selection import ALL_PRODUCTS, REPLAYED_PRODUCTS
+from marsyard.campaigns.store.products import PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
 

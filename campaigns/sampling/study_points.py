@@ -5,9 +5,11 @@ standard normal variable: its inverse distribution at Phi(z), after the correlat
 a case (noise of the instruments, for example) have no coordinates; a point selects them by a number.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -18,14 +20,16 @@ from marsyard.sim.streams import Blend
 
 #: Column of stored rows that contains the point of the case, as text.
 POINT_COLUMN = "standard_point"
+#: Number of the new random streams of a case that is not yet run; they get the number of the case.
+NEW_STREAM = -1
 
 
 @dataclass(frozen=True)
 class StudyPoint:
-    """A case as a point in standard normal space.
+    """A case, stored or to be run, as a point in standard normal space.
 
     - coordinates: independent standard normal numbers of the random dispersions, in the order of the campaign file
-    - stream: number of the random streams of the case (`marsyard.sim.streams`)
+    - stream: number of the random streams of the case (`marsyard.sim.streams`), or `NEW_STREAM`
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
     - blend: components of blended random streams, of which `stream` is the newest; empty for one component
@@ -33,7 +37,7 @@ class StudyPoint:
     """
 
     coordinates: tuple[float, ...]
-    stream: int
+    stream: int = NEW_STREAM
     nominal: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     blend: Blend = ()
@@ -52,11 +56,21 @@ class StudyPoint:
         except (TypeError, ValueError) as error:
             raise ValueError(f"not a point of a study: {text!r:.100}") from error
 
+    def with_numbers(self, case: int) -> StudyPoint:
+        """Return the point as a case, whose number the new streams get."""
+        stream = case if self.stream == NEW_STREAM else self.stream
+        return replace(self, stream=stream, blend=number_blend(self.blend, case))
+
     @property
     def text(self) -> str:
         """The point as text, without loss of precision."""
         rest = [self.blend, self.values] if self.values else [self.blend] if self.blend else []
         return json.dumps([self.coordinates, self.stream, self.nominal, self.removed, *rest])
+
+
+def number_blend(blend: Blend, case: int) -> Blend:
+    """Give the new component of a blend of random streams the number of its case."""
+    return tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
 
 
 def transform_to_uniform(

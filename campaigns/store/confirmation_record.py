@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.claims import DEFINITION, FrozenAlgorithm, confirmation_seed
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import DEFINITION, Confirmation, FrozenAlgorithm, confirmation_seed
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
 

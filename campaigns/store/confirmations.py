@@ -8,22 +8,26 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from marsyard.campaigns.definition.calibration_terrains import calibration_overlap, uses_imported_terrain
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.claims import (
+    Confirmation,
     bank_seeds,
     confirmation_bank_seeds,
     confirmation_seed,
     freeze_algorithm,
     requirement_key,
 )
-from marsyard.campaigns.definition.confirmation import Confirmation
-from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind, classify_evidence
+from marsyard.campaigns.definition.evidence import (
+    Evidence,
+    EvidenceKind,
+    calibration_overlap,
+    classify_evidence,
+    uses_imported_terrain,
+)
 from marsyard.campaigns.definition.parameter_paths import find_value, replace_values
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.confirmation_record import ConfirmationRecord, find_own_entry, parse_record, read_record
-from marsyard.campaigns.store.git_registration import find_campaign_file_problem, find_registration_problem
-from marsyard.campaigns.store.machine import git_commit
+from marsyard.campaigns.store.git_history import find_campaign_file_problem, find_registration_problem, git_commit
 from marsyard.campaigns.store.record import utc_now
 from marsyard.scenarios.interface import HasAlgorithms
 
@@ -91,7 +95,7 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     CampaignError if the run repeats an unfinished confirmation with another number of cases.
     """
     path, frozen, definition = campaign.confirmations, freeze_algorithm(campaign), campaign.definition
-    registration = find_registration_problem(path) or find_campaign_file_problem(path, campaign.command)
+    registration = find_registration_problem(path) or find_campaign_file_problem(path, campaign.file)
     with _open_locked(path) as file:
         record = _start_chain(file, path)
         seeds = _derive_seeds(campaign, frozen.claim, record)

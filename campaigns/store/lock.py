@@ -1,4 +1,4 @@
-"""Lock of a campaign's folder, with a heartbeat for file systems without locks.
+"""Lock of the folder of a new or stored campaign, with a heartbeat for file systems without locks.
 
 The kernel releases its lock when the process ends. File systems of clusters can be mounted without locks, or with locks
 that other machines do not see. Therefore, the process that uses a folder also updates the time of the lock file.
@@ -18,10 +18,14 @@ from pathlib import Path
 from typing import TextIO
 
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.store.record import RECORD_FILE
+from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 from marsyard.campaigns.store.temporary_files import machine_id, process_exists, remove_abandoned
 
 #: Lock file of the process that uses the folder.
 _LOCK_FILE = "campaign.lock"
+#: Files of a campaign; a folder that contains any of them is never used for another campaign.
+_CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 #: Time between two heartbeats, and time without one after which a process is considered dead, s.
 _BEAT_S, _SILENCE_S = 2.0, 15.0
 #: Errors of `flock` if another process has the lock; other errors mean that the file system has no locks.
@@ -59,6 +63,32 @@ def folder_lock(directory: Path) -> Iterator[None]:
             heart.join()
             with suppress(OSError):
                 file.truncate(0)
+
+
+@contextmanager
+def lock_new_folder(directory: Path) -> Iterator[None]:
+    """Create and lock the folder of a new campaign.
+
+    The folder of a run that was killed before its first record can be reused. Raises StoreError if the folder contains
+    a campaign, another process uses it, or it is not writable.
+    """
+    _claim_folder(directory)
+    with folder_lock(directory):
+        # again, because another process may have started a campaign in the folder before the lock
+        _claim_folder(directory)
+        yield
+
+
+def _claim_folder(directory: Path) -> None:
+    """Create the folder of a new campaign. Raises StoreError if it contains a campaign or is not writable."""
+    with report_write_errors(directory):
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise StoreError(f"{directory} is not a folder; choose another folder with --out") from error
+        campaign_files = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
+        if campaign_files and (campaign_files != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
+            raise StoreError(f"{directory} contains a campaign ({campaign_files[0]}); choose another folder with --out")
 
 
 def is_locked(directory: Path) -> bool:

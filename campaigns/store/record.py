@@ -2,6 +2,8 @@
 
 import json
 import os
+import platform
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -13,9 +15,10 @@ from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.hidden_folders import hide_folders
-from marsyard.campaigns.store.machine import describe_machine, git_commit
+from marsyard.campaigns.store.git_history import git_commit
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 from marsyard.campaigns.store.temporary_files import replace_file
+from marsyard.sim.kernel_cache import processor_features
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -56,7 +59,7 @@ def write_first_record(
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
     evidence: Mapping[str, Any] | None = None,
-    origin: Mapping[str, Any] | None = None,
+    origin: Mapping[str, Any],
 ) -> None:
     """Write the record of a new campaign.
 
@@ -88,7 +91,7 @@ def write_first_record(
             else None,
             "algorithms": list(algorithms),
             "evidence": None if evidence is None else dict(evidence),
-            "origin": None if origin is None else dict(origin),
+            "origin": dict(origin),
             "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,
@@ -107,6 +110,26 @@ def describe_session(command: str, executor: str, cases_before: int) -> dict[str
         "workers": executor,
         "cases_before": cases_before,
         "environment": describe_machine(),
+    }
+
+
+def describe_machine() -> dict[str, Any]:
+    """Describe Python, platform and processor (with a hash of its features).
+
+    Machines with equal descriptions compute bit-identical rows.
+    """
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
+    return {
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processor": model[1] if model else platform.processor(),
+        "processor_features": processor_features(),
     }
 
 

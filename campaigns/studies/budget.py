@@ -24,9 +24,10 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
+from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.studies.contributions import MIN_COMMON, compute_budget
-from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
+from marsyard.campaigns.studies.point_runner import CaseLimitError, PointRunner
 from marsyard.campaigns.studies.results import BUDGET, BudgetParameters, BudgetResult, SobolIndex
 from marsyard.campaigns.studies.runner import StudySession, check_margin, find_requirement, start_study
 from marsyard.scenarios.error_sources import ScenarioSource, error_sources
@@ -183,7 +184,7 @@ class BudgetStudy:
         for first in range(0, n, _BATCH):
             cases = range(first, min(first + _BATCH, n))
             candidates = [
-                Candidate(tuple(points[case].tolist()), case, (), variant.removed)
+                StudyPoint(tuple(points[case].tolist()), case, (), variant.removed)
                 for case in cases
                 for variant in variants
             ]
@@ -211,7 +212,7 @@ class BudgetStudy:
         block = len(paths) + 2
         for first in range(0, len(uniform), block):
             cases = range(first, first + block)
-            rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
+            rows = self._runner.run([StudyPoint(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
             errors += [self._error(row) for row in rows]
         return compute_indices(np.array(errors), problem, self._parameters.confidence, seed)
 

@@ -9,6 +9,9 @@ from scipy.stats import t as student_t
 
 from marsyard.campaigns.json_numbers import Number
 
+#: Number of replicates from which a study cannot be decided by more of them.
+_MAX_REPLICATES = 10_000
+
 
 @dataclass(frozen=True)
 class ProbabilityInterval:
@@ -16,7 +19,8 @@ class ProbabilityInterval:
 
     - estimate, lower, upper: probability, and bounds of the interval
     - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
-    - log_sd: standard deviation of the logarithm of one replicate's estimate
+    - log_sd: standard deviation of the logarithm of an estimate: that of one replicate, or that of all cases of
+      importance sampling together
     """
 
     estimate: Number
@@ -39,16 +43,35 @@ def replicate_interval(estimates: Sequence[float], confidence: float) -> Probabi
     and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))).
     """
     values = np.array(estimates, dtype=np.float64)
-    count = values.size
-    if count < 2:
-        raise ValueError(f"an interval needs at least 2 replicates, not {count}")
+    if values.size < 2:
+        raise ValueError(f"an interval needs at least 2 replicates, not {values.size}")
     logarithms = np.log(values)
     variance = float(logarithms.var(ddof=1))
     centre = float(logarithms.mean()) + 0.5 * variance
-    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), count - 1))
-    half_width = quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1)))
+    half_width = _log_half_width(variance, values.size, confidence)
     lower, upper = math.exp(centre - half_width), min(math.exp(centre + half_width), 1.0)
     return ProbabilityInterval(float(values.mean()), lower, upper, confidence, math.sqrt(variance))
+
+
+def _log_half_width(variance: float, replicates: int, confidence: float) -> float:
+    """Compute the half-width of Cox's interval, as a logarithm, from the variance of the logarithms of estimates."""
+    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), replicates - 1))
+    return quantile * math.sqrt(variance / replicates + variance**2 / (2.0 * (replicates - 1)))
+
+
+def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:
+    """Estimate the number of additional replicates whose interval (`replicate_interval`) excludes the limit.
+
+    - interval: interval of the present replicates; their spread is assumed to remain the same
+    - replicates: number of the present replicates
+
+    None if the estimate is so close to the limit that fewer than `_MAX_REPLICATES` do not decide.
+    """
+    distance = abs(math.log(max_probability / interval.estimate)) if interval.estimate > 0.0 else math.inf
+    for count in range(replicates + 1, _MAX_REPLICATES if distance > 0.0 else 0):
+        if _log_half_width(interval.log_sd**2, count, interval.confidence) <= distance:
+            return count - replicates
+    return None
 
 
 def weighted_interval(contributions: Sequence[float], confidence: float) -> ProbabilityInterval:
@@ -76,20 +99,3 @@ def effective_number(weights: Sequence[float]) -> float:
 def enclose(first: ProbabilityInterval, second: ProbabilityInterval) -> ProbabilityInterval:
     """Return the first interval, extended so that it contains the second one."""
     return replace(first, lower=min(first.lower, second.lower), upper=max(first.upper, second.upper))
-
-
-def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:
-    """Estimate the number of additional replicates that decide the verdict.
-
-    None if the estimate is so close to the limit that fewer than 10,000 replicates do not decide it.
-    The spread of the replicates is assumed to remain the same.
-    """
-    distance = abs(math.log(max_probability / interval.estimate)) if interval.estimate > 0.0 else math.inf
-    if distance == 0.0:
-        return None
-    variance, confidence = interval.log_sd**2, interval.confidence
-    for count in range(replicates + 1, 10_000):
-        quantile = float(student_t.ppf(0.5 * (1.0 + confidence), count - 1))
-        if quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1))) <= distance:
-            return count - replicates
-    return None

@@ -1,11 +1,9 @@
-"""Cases of a study: candidates for its points, and the runner that evaluates them or reads their stored rows."""
+"""Runner of the cases of a study: it evaluates points, or reads their stored rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.evidence import Evidence
@@ -19,8 +17,6 @@ from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.product_selection import ProductSelection
 from marsyard.campaigns.store.rows import Row, RowStore
-from marsyard.campaigns.studies.subset import NEW_STREAM
-from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
@@ -28,32 +24,6 @@ _MAX_FIRST_CRASHES = 20
 
 class CaseLimitError(Exception):
     """The study needs more cases than its limit."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.study_points.StudyPoint`).
-
-    - coordinates: standard normal numbers of the random dispersions
-    - stream: number of the case's random streams; None for new streams
-    - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
-    - removed: names of the sources of error that the case does not have
-    - blend: components of the random streams, the last with the number `NEW_STREAM`; empty for one component
-    - values: paths and values of parameters that replace those of the campaign
-    """
-
-    coordinates: tuple[float, ...]
-    stream: int | None = None
-    nominal: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
-    blend: Blend = ()
-    values: tuple[tuple[str, Any], ...] = ()
-
-    def point(self, case: int) -> StudyPoint:
-        """Return the point of the candidate as a case; new streams have the number of the case."""
-        stream = case if self.stream is None else self.stream
-        blend = tuple((case if number == NEW_STREAM else number, weight) for number, weight in self.blend)
-        return StudyPoint(self.coordinates, stream, self.nominal, self.removed, blend, self.values)
 
 
 class PointRunner:
@@ -77,8 +47,8 @@ class PointRunner:
         """Kind of evidence of the study's seed."""
         return Evidence.read(record.read(self._directory).get("evidence"))
 
-    def run(self, candidates: Sequence[Candidate], reserved_cases: int = 0) -> list[Row]:
-        """Evaluate points in parallel; return their rows in the same order.
+    def run(self, new_points: Sequence[StudyPoint], reserved_cases: int = 0) -> list[Row]:
+        """Evaluate points in parallel; return their rows in the same order. New streams have the number of the case.
 
         reserved_cases: number of cases, out of the limit, that these points cannot use
         Raises CaseLimitError before the first case beyond the limit, StoreError if a stored row has another point, and
@@ -86,9 +56,9 @@ class PointRunner:
         """
         first = self.n_cases
         limit = self._campaign.definition.total_cases - reserved_cases
-        if first + len(candidates) > limit:
+        if first + len(new_points) > limit:
             raise CaseLimitError(f"the study needs more than {limit} cases")
-        points = {case: item.point(case) for case, item in enumerate(candidates, start=first)}
+        points = {case: point.with_numbers(case) for case, point in enumerate(new_points, start=first)}
         rows = {case: row for case in points if (row := self._store.row(case)) is not None}
         for case, row in rows.items():
             if row.get(POINT_COLUMN) != points[case].text:
@@ -112,7 +82,7 @@ class PointRunner:
                     self._is_checked = True
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
-        self.n_cases += len(candidates)
+        self.n_cases += len(new_points)
         self._has_finished_case |= any(row["outcome"] not in ENGINE_FAILURES for row in rows.values())
         if not self._has_finished_case and self.n_cases >= _MAX_FIRST_CRASHES:
             error = next(iter(rows.values())).get("error")

@@ -28,9 +28,10 @@ from marsyard.campaigns.definition.margins import compute_margin, describe_margi
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
+from marsyard.campaigns.sampling.study_points import StudyPoint, number_blend
 from marsyard.campaigns.studies import subset
 from marsyard.campaigns.studies.importance import fit_density
-from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
+from marsyard.campaigns.studies.point_runner import CaseLimitError, PointRunner
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
 from marsyard.campaigns.studies.runner import StudySession, check_margin, continue_study, find_requirement, start_study
@@ -197,17 +198,14 @@ class _RareStudy:
         coordinates = np.concatenate([group.coordinates for group in proposals])
         blends = [blend for group in proposals for blend in group.blends]
         first = self._runner.n_cases
-        candidates = [
-            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
+        points = [
+            StudyPoint(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
             for point, blend in zip(coordinates, blends, strict=True)
         ]
-        rows = self._runner.run(candidates, self._reserved_cases)
+        rows = self._runner.run(points, self._reserved_cases)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
-        numbered = [
-            tuple((case if number == subset.NEW_STREAM else number, weight) for number, weight in blend)
-            for case, blend in enumerate(blends, start=first)
-        ]
+        numbered = [number_blend(blend, case) for case, blend in enumerate(blends, start=first)]
         ends = np.cumsum([len(group.blends) for group in proposals])
         for group, start, end in zip(proposals, [0, *ends[:-1]], ends, strict=True):
             if group.is_independent:

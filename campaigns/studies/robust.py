@@ -24,11 +24,12 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
-from marsyard.campaigns.studies.point_runner import Candidate, PointRunner
+from marsyard.campaigns.studies.point_runner import PointRunner
 from marsyard.campaigns.studies.results import ROBUST, RobustParameters, RobustResult, RobustVariant
 from marsyard.campaigns.studies.runner import StudySession, check_identity, start_study
 from marsyard.campaigns.studies.study_record import STUDY_KEY
@@ -163,11 +164,11 @@ class RobustCasesStudy:
         observer.begin("cases", len(variants) * len(cases))
         for first in range(0, len(cases), _BATCH):
             batch = cases[first : first + _BATCH]
-            self._runner.run([self._candidate(case, variant.values) for case in batch for variant in variants])
+            self._runner.run([self._point(case, variant.values) for case in batch for variant in variants])
         return RobustResult(self._runner.n_cases)
 
-    def _candidate(self, case: int, values: Mapping[str, Any]) -> Candidate:
+    def _point(self, case: int, values: Mapping[str, Any]) -> StudyPoint:
         uniform = self._campaign.draw_uniform(case)
         coordinates = tuple(ndtri([uniform[path] for path in self._campaign.drawn_paths]).tolist())
         fixed = tuple(path for path in values if path in self._campaign.definition.dispersions)
-        return Candidate(coordinates, case, nominal=fixed, values=tuple(values.items()))
+        return StudyPoint(coordinates, case, nominal=fixed, values=tuple(values.items()))

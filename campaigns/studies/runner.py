@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.identity import Identity, create_identity
@@ -24,15 +23,13 @@ from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.running.compilation import compile_kernels
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.shared_inputs import prepare_inputs
-from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+from marsyard.campaigns.running.stored_campaign import create_files, load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import classify_run
-from marsyard.campaigns.store.lock import folder_lock
-from marsyard.campaigns.store.new_folder import claim_folder
-from marsyard.campaigns.store.origin import check_rows, describe_origin
-from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
+from marsyard.campaigns.store.lock import folder_lock, lock_new_folder
+from marsyard.campaigns.store.origin import check_rows
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.campaigns.studies.point_runner import PointRunner
 from marsyard.campaigns.studies.results import BudgetResult, RareResult, RobustResult, SearchResult
@@ -79,7 +76,8 @@ def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = N
     if not campaign.drawn_paths:
         raise CampaignError(f"campaign '{definition.name}' has no random dispersion")
     changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
-    return replace(campaign, definition=definition.model_copy(update=changes))
+    # no command: `marsyard run` does not repeat a study
+    return replace(campaign, definition=definition.model_copy(update=changes), command=())
 
 
 def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
@@ -99,23 +97,6 @@ def check_margin(requirement: Requirement) -> None:
         )
 
 
-def create_study(campaign: Campaign, directory: Path, session: StudySession[Any, Any]) -> None:
-    """Create the folder of a study with its parameters in the record. Raises StoreError as for a campaign's folder."""
-    identity = create_identity(campaign.definition)
-    evidence = classify_run(campaign)
-    create_store(directory / ROWS_FILE, {"identity": identity.definition})
-    record.write_first_record(
-        directory,
-        campaign.definition,
-        identity,
-        session.executor.describe(),
-        algorithms=describe_algorithms(campaign),
-        evidence=evidence.to_table(),
-        origin=describe_origin(campaign.definition),
-    )
-    record.update(directory, {STUDY_KEY: session.kind.encode(session.parameters)})
-
-
 def start_study(
     campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Any, Result], streams: int | None = None
 ) -> Result:
@@ -124,11 +105,9 @@ def start_study(
     Raises CampaignError for an unsuitable campaign or folder.
     """
     study_campaign = prepare_campaign(campaign, max_cases, streams)
-    claim_folder(directory)
-    with folder_lock(directory):
-        # again, because another process may have started a campaign in the folder before the lock
-        claim_folder(directory)
-        create_study(study_campaign, directory, session)
+    with lock_new_folder(directory):
+        create_files(study_campaign, directory, session.executor)
+        record.update(directory, {STUDY_KEY: session.kind.encode(session.parameters)})
         return _run_study(study_campaign, directory, session)
 
 

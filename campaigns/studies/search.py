@@ -8,25 +8,30 @@
    same random streams.
 4. Violations that are close to a reduced one in its remaining dispersions have the same cause. Step 3 is repeated with
    the other violations.
+
+`write_regression_campaigns` writes the reduced violations as campaigns.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cma
 import numpy as np
+import tomli_w
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
+from marsyard.campaigns.errors import report_write_errors
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
-from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
+from marsyard.campaigns.studies.point_runner import CaseLimitError, PointRunner
 from marsyard.campaigns.studies.results import SEARCH, FoundFailure, SearchParameters, SearchResult
 from marsyard.campaigns.studies.runner import StudySession, find_requirement, start_study
 from marsyard.sim.streams import Streams
@@ -111,10 +116,10 @@ class SearchStudy:
             reason,
         )
 
-    def _evaluate(self, candidates: Sequence[Candidate]) -> list[_EvaluatedPoint]:
+    def _evaluate(self, points: Sequence[StudyPoint]) -> list[_EvaluatedPoint]:
         """Run cases, and add them to the evaluated cases of the study."""
         first = self.runner.n_cases
-        rows = self.runner.run(candidates)
+        rows = self.runner.run(points)
         new_cases = [
             _EvaluatedPoint(
                 first + index,
@@ -139,7 +144,7 @@ class SearchStudy:
         exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.parameters.cases, 2.0)))
         sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
         coordinates = np.clip(ndtri(sequence), -_MAX_COORDINATE, _MAX_COORDINATE)
-        self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
+        self._evaluate([StudyPoint(tuple(point.tolist())) for point in coordinates])
 
     def _evolve(self) -> None:
         """Run evolution strategies in parallel until the cases are used."""
@@ -164,7 +169,7 @@ class SearchStudy:
         size = strategies[0].popsize
         while self.runner.n_cases + size * len(strategies) <= parameters.cases:
             populations = [strategy.ask() for strategy in strategies]
-            candidates = [Candidate(tuple(map(float, point))) for points in populations for point in points]
+            candidates = [StudyPoint(tuple(map(float, point))) for points in populations for point in points]
             margins = _replace_infinite(np.array([item.margin for item in self._evaluate(candidates)]))
             for number, (strategy, points) in enumerate(zip(strategies, populations, strict=True)):
                 strategy.tell(points, margins[number * size : (number + 1) * size].tolist())
@@ -213,7 +218,7 @@ class SearchStudy:
                 )
                 continue
             reduced_points.append((paths, reduced_coordinates))
-            repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
+            repetition = StudyPoint(reduction.point.coordinates, nominal=reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.parameters.repetitions)
             failures.append(
                 FoundFailure(
@@ -237,7 +242,7 @@ class SearchStudy:
             size = math.ceil(len(paths) / group_count)
             groups = [paths[start : start + size] for start in range(0, len(paths), size)]
             candidates = [
-                Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *group))
+                StudyPoint(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *group))
                 for group in groups
             ]
             trials = self._evaluate(candidates)
@@ -262,7 +267,7 @@ class SearchStudy:
                 middle = 0.5 * (low + high)
                 coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
-                (trial,) = self._evaluate([Candidate(tuple(coordinates), failure.point.stream, failure.point.nominal)])
+                (trial,) = self._evaluate([StudyPoint(tuple(coordinates), failure.point.stream, failure.point.nominal)])
                 if trial.margin < 0.0:
                     failure, high = trial, middle
                 else:
@@ -281,3 +286,43 @@ def _replace_infinite(margins: np.ndarray) -> np.ndarray:
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     width = max(high - low, 1.0)
     return np.asarray(np.clip(margins, low - width, high + width))
+
+
+def write_regression_campaigns(campaign: Campaign, result: SearchResult, directory: Path) -> list[Path]:
+    """Write one campaign file per reduced violation into DIR/failures, and a plan of nightly runs with all of them.
+
+    Each file has the parameters of the reduced case, no dispersions, and new random streams for each of its cases.
+    """
+    folder, paths = directory / "failures", list[Path]()
+    definition = campaign.definition
+    requirement = find_requirement(campaign, SEARCH.read_parameters(directory).requirement)
+    with report_write_errors(folder):
+        folder.mkdir(exist_ok=True)
+        for number, failure in enumerate(result.failures, start=1):
+            name = f"{definition.name}-failure-{number}"
+            values_text = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
+            tables = {
+                "name": name,
+                "scenario": definition.scenario,
+                "description": f"Violation of {requirement.id} with {values_text or 'the parameters of the campaign'}.",
+                "cases": max(failure.repetitions, 1),
+                "seed": definition.seed,
+                "parameters": campaign.with_values(failure.values).model_dump(mode="json"),
+                "requirements": [requirement.model_dump(mode="json")],
+            }
+            paths.append(folder / f"{name}.toml")
+            paths[-1].write_text(tomli_w.dumps(_without_none(tables)), encoding="utf-8")
+        plan = {"campaigns": [{"campaign": path.name} for path in paths]}
+        (folder / "nightly.toml").write_text(tomli_w.dumps(plan), encoding="utf-8")
+    return paths
+
+
+def _short_text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _without_none(value: Any) -> Any:
+    """Remove keys without a value, which TOML cannot represent; they have their default."""
+    if isinstance(value, dict):
+        return {name: _without_none(inner) for name, inner in value.items() if inner is not None}
+    return [_without_none(inner) for inner in value] if isinstance(value, list | tuple) else value

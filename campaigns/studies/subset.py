@@ -22,6 +22,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from marsyard.campaigns.sampling.study_points import NEW_STREAM
 from marsyard.sim.streams import Blend
 
 #: Fraction of the cases that define the next level.
@@ -30,8 +31,6 @@ LEVEL_FRACTION = 0.1
 _TARGET_ACCEPTANCE, _INITIAL_STEP = 0.44, 0.6
 #: Minimum number of cases below a plateau: the fraction of fewer cases is too uncertain for the product of fractions.
 _MIN_CASES_BELOW_PLATEAU = 5
-#: Stream number of a proposed case that gets new random streams.
-NEW_STREAM = -1
 
 Coordinates = Float64[np.ndarray, "n dimensions"]
 Margins = Float64[np.ndarray, " n"]

@@ -1,6 +1,6 @@
-"""The command line `marsyard`: registers all commands; defines `doctor`.
+"""The command line `marsyard`: its commands, and the options that precede them.
 
-Commands import their dependencies when they run, so that ``--help`` is fast.
+A command is imported when it is used, so that it does not wait for the imports of the others.
 """
 
 import importlib
@@ -8,33 +8,56 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import typer
 from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
-from marsyard.cli.assure import assure
-from marsyard.cli.campaign import append, merge, resume, run
-from marsyard.cli.catalogue import list_campaigns, show
-from marsyard.cli.compilation import compile_kernels
-from marsyard.cli.conformance import conformance
-from marsyard.cli.console import create_console
-from marsyard.cli.dashboard import dashboard
-from marsyard.cli.dataset import dataset
 from marsyard.cli.errors import Exit, handle_user_errors
-from marsyard.cli.export import export, score
-from marsyard.cli.housekeeping import clean
-from marsyard.cli.ingest import ingest
-from marsyard.cli.new import new
-from marsyard.cli.nightly import nightly
-from marsyard.cli.options import JsonOption
-from marsyard.cli.render import gallery, render
-from marsyard.cli.replay import replay
-from marsyard.cli.report import compare, confirmations, report
-from marsyard.cli.studies import budget, rare, robust, search
-from marsyard.cli.terrain import app as terrain
+
+#: Commands by help panel: their names, and their functions as ``module:function`` of this package.
+PANELS = {
+    "Run campaigns": {
+        "list": "catalogue:list_campaigns",
+        "show": "catalogue:show",
+        "run": "campaign:run",
+        "resume": "campaign:resume",
+        "append": "campaign:append",
+        "merge": "campaign:merge",
+        "replay": "replay:replay",
+        "rare": "studies:rare",
+        "search": "studies:search",
+        "budget": "studies:budget",
+        "robust": "studies:robust",
+        "nightly": "nightly:nightly",
+    },
+    "Results": {
+        "report": "report:report",
+        "confirmations": "report:confirmations",
+        "compare": "report:compare",
+        "dashboard": "publishing:dashboard",
+        "assure": "publishing:assure",
+    },
+    "Worlds and images": {
+        "render": "images:render",
+        "gallery": "images:gallery",
+        "dataset": "images:dataset",
+        "terrain": "terrain:app",
+    },
+    "Custom campaigns and algorithms": {
+        "new": "new:new",
+        "ingest": "new:ingest",
+        "conformance": "conformance:conformance",
+        "export": "export:export",
+        "score": "export:score",
+    },
+    "Housekeeping": {
+        "doctor": "housekeeping:doctor",
+        "compile": "housekeeping:compile_kernels",
+        "clean": "housekeeping:clean",
+    },
+}
 
 
 class _FlagsWithoutType:
@@ -57,9 +80,40 @@ class _Group(_FlagsWithoutType, TyperGroup):
     pass
 
 
+class _CommandTable(_Group):
+    """The commands of `PANELS`; each is imported when it is used, an unknown name imports all to find a similar one."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands in the order of the help."""
+        return [name for commands in PANELS.values() for name in commands]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command with a name; None if there is none."""
+        names = self.list_commands(ctx)
+        for name in [cmd_name] if cmd_name in names else names:
+            if name not in self.commands:
+                self.commands[name] = _import_command(name)
+        return self.commands.get(cmd_name)
+
+
+def _import_command(name: str) -> Any:
+    """Import the command, or the group of commands, with a name in `PANELS`."""
+    panel, path = next((panel, commands[name]) for panel, commands in PANELS.items() if name in commands)
+    module, _, attribute = path.partition(":")
+    target = getattr(importlib.import_module(f"marsyard.cli.{module}"), attribute)
+    owner = typer.Typer(add_completion=False)
+    if isinstance(target, typer.Typer):
+        for registered in target.registered_commands:
+            registered.cls = _Command
+        owner.add_typer(target, name=name, cls=_Group, rich_help_panel=panel)
+        return typer.main.get_group(owner).commands[name]
+    owner.command(name=name, cls=_Command, rich_help_panel=panel)(target)
+    return typer.main.get_command(owner)
+
+
 app = typer.Typer(
     name="marsyard",
-    cls=_Group,
+    cls=_CommandTable,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Run vision software on simulated Mars images with ground truth, and report whether it meets its requirements "
@@ -68,13 +122,6 @@ app = typer.Typer(
     "2 the command or a file is invalid; 3 no verdict: too few cases, or cases that are not independent random draws; "
     "4 all requirements met, but a person must judge the evidence; 130 interrupted.",
 )
-
-
-def doctor(as_json: JsonOption = False) -> None:
-    """Check the machine and the installation, and print a remedy for each problem."""
-    from marsyard.doctor import run as run_checks
-
-    raise typer.Exit(run_checks(create_console(), as_json=as_json))
 
 
 def _print_version(is_requested: bool) -> None:
@@ -116,23 +163,6 @@ def _select_device(device: str) -> None:
         importlib.import_module("marsyard.sim.render.device")
     except RuntimeError as error:  # its `RenderingError`, which cannot be imported if the device does not work
         raise CampaignError(str(error)) from None
-
-
-#: Commands by help panel; the first word of a function's name is the command's name.
-PANELS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Run campaigns": (list_campaigns, show, run, resume, append, merge, replay, rare, search, budget, robust, nightly),
-    "Results": (report, confirmations, compare, dashboard, assure),
-    "Worlds and images": (render, gallery, dataset),
-    "Custom campaigns and algorithms": (new, ingest, conformance, export, score),
-    "Housekeeping": (doctor, compile_kernels, clean),
-}
-for panel, commands in PANELS.items():
-    for command in commands:
-        app.command(name=command.__name__.partition("_")[0], cls=_Command, rich_help_panel=panel)(command)
-    if panel == "Worlds and images":
-        for registered in terrain.registered_commands:
-            registered.cls = _Command
-        app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,6 @@ from typer import Argument, Option
 from marsyard.cli import options
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
-from marsyard.cli.option_classes import with_options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
@@ -20,91 +19,125 @@ if TYPE_CHECKING:
     from marsyard.campaigns.running.progress import ProgressObserver
 
 
-@dataclass(frozen=True)
-class RunOptions:
-    """Arguments and options of `marsyard run`."""
-
-    campaign: options.CampaignArgument
-    cases: options.CasesOption = None
-    seed: options.SeedOption = None
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-    case_time: options.CaseTimeOption = None
-    out: options.OutOption = None
+@handle_user_errors
+def run(
+    campaign: options.CampaignArgument,
+    cases: options.CasesOption = None,
+    seed: options.SeedOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    case_time: options.CaseTimeOption = None,
+    out: options.OutOption = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
         False
-    )
+    ),
     until_decided: Annotated[
         bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
-    ] = False
-    override: options.SetOption = None
-    algorithm: options.AlgorithmOption = None
+    ] = False,
+    override: options.SetOption = None,
+    algorithm: options.AlgorithmOption = None,
     confirm: Annotated[
         bool,
         Option(
             "--confirm",
             help="Evaluate a frozen algorithm on unseen cases: draw a new seed, and record the run before it starts.",
         ),
-    ] = False
-    confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
+    ] = False,
+    confirmations: options.ConfirmationsOption = options.CONFIRMATIONS,
     shard: Annotated[
         str | None,
         Option(
             metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines the shards."
         ),
-    ] = None
-
-
-@handle_user_errors
-@with_options(RunOptions)
-def run(arguments: RunOptions) -> None:
+    ] = None,
+) -> None:
     """Run a campaign, evaluate its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError
 
-    changes = list(arguments.override or [])
-    if arguments.case_time is not None:
-        changes.append(f"limits.case_time_s={arguments.case_time}")
-    campaign = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
-    campaign = replace(campaign, confirmations=arguments.confirmations)
-    if arguments.shard is not None and (arguments.confirm or arguments.until_decided):
-        from marsyard.campaigns.errors import CampaignError
-
+    changes = list(override or [])
+    if case_time is not None:
+        changes.append(f"limits.case_time_s={case_time}")
+    selected = load_campaign(campaign, changes, cases, seed, algorithm or [])
+    selected = replace(selected, confirmations=confirmations)
+    if shard is not None and (confirm or until_decided):
         raise CampaignError("--shard cannot be combined with --confirm or --until-decided")
-    if arguments.confirm:
-        from marsyard.campaigns.errors import CampaignError
-        from marsyard.campaigns.store.confirmations import select_confirmation_seed
-
-        if arguments.seed is not None:
-            raise CampaignError("--confirm and --seed cannot be combined: a confirmation draws its seed")
-        campaign = select_confirmation_seed(campaign)
+    if confirm and seed is not None:
+        raise CampaignError("--confirm and --seed cannot be combined: a confirmation draws its seed")
     # imported after loading, so that an error in the file is reported without delay
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli.estimate import print_estimate, print_limits
-    from marsyard.cli.until_decided import run_until_decided
-
-    executor = make_executor(arguments.jobs, arguments.cluster)
-    if arguments.dry_run:
-        print_estimate(campaign, executor)
-        print_limits(campaign)
-        return
-    directory = arguments.out if arguments.out is not None else default_directory(campaign.definition.name)
-    if arguments.shard is not None:
-        run_shard(campaign, arguments.shard, directory, executor)
-        return
-    run_cases = run_until_decided if arguments.until_decided else run_campaign
-    run_and_evaluate(directory, lambda observer: run_cases(campaign, directory, executor, observer))
-
-
-def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: ExecutorConfig) -> None:
-    """Run a shard of a campaign in a folder, and print how to combine the shards."""
-    from marsyard.campaigns.running.engine import run_campaign
     from marsyard.campaigns.running.shards import Shard
-    from marsyard.cli.run_log import RunLog
+    from marsyard.campaigns.store.confirmations import select_confirmation_seed
+    from marsyard.cli.estimate import print_estimate, print_limits
+    from marsyard.cli.progress import RunLog
 
-    shard = Shard.parse(shard_text)
-    with show_progress(directory) as progress, RunLog(directory, progress) as log:
-        run_campaign(campaign, directory, executor, log, shard)
-    typer.echo(f"shard {shard}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
+    if confirm:
+        selected = select_confirmation_seed(selected)
+    executor = make_executor(jobs, cluster)
+    if dry_run:
+        print_estimate(selected, executor)
+        print_limits(selected)
+        return
+    directory = out if out is not None else default_directory(selected.definition.name)
+    if shard is not None:
+        part = Shard.parse(shard)
+        with show_progress(directory) as progress, RunLog(directory, progress) as log:
+            run_campaign(selected, directory, executor, log, part)
+        typer.echo(f"shard {part}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
+        return
+    run_cases = run_until_decided if until_decided else run_campaign
+    run_and_evaluate(directory, lambda observer: run_cases(selected, directory, executor, observer))
+
+
+def run_until_decided(
+    campaign: Campaign, directory: Path, executor: ExecutorConfig, observer: ProgressObserver
+) -> None:
+    """Run a campaign until its verdicts are decided, with at most the configured number of cases.
+
+    See `marsyard.reports.statistics.sequential`. Raises CampaignError for dependent draws, or if no requirement has a
+    confidence level.
+    """
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.reports.sampling_design import read_sampling_design
+    from marsyard.reports.statistics.sequential import planned_looks
+    from marsyard.reports.verdicts import ESTIMATE
+
+    definition = campaign.definition
+    design = read_sampling_design(definition.model_dump(mode="json"))
+    if not design.independent:
+        raise CampaignError(f"--until-decided: {design.no_probability_reason}")
+    if all(requirement.decide_by == ESTIMATE for requirement in definition.requirements):
+        raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
+    max_cases = definition.total_cases
+    first_block = definition.model_copy(
+        update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
+    )
+    command = (*campaign.command, "--until-decided")
+    run_campaign(replace(campaign, definition=first_block, command=command), directory, executor, observer)
+    _continue_until_decided(directory, executor, observer)
+
+
+def _continue_until_decided(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
+    """Append cases at the planned interim evaluations until the campaign is decided."""
+    from marsyard.campaigns.running.engine import append_cases
+    from marsyard.campaigns.store.record import stored_definition
+    from marsyard.reports.evaluation import evaluate_run
+    from marsyard.reports.looks import next_look
+    from marsyard.reports.wording import count
+
+    while True:
+        definition = stored_definition(directory)
+        if definition.max_cases is None:
+            return
+        evaluation, cases = evaluate_run(directory), definition.total_cases
+        # a decided verdict that is withheld for its kind of evidence needs no further cases
+        verdicts = [replace(item, status=item.withheld_status or item.status) for item in evaluation.verdicts]
+        next_cases = next_look(verdicts, evaluation.sampling, cases)
+        if next_cases is None:
+            observer.note(f"stopped after {cases} of at most {count(definition.max_cases, 'case')}")
+            return
+        append_cases(directory, next_cases - cases, executor, observer)
 
 
 @handle_user_errors
@@ -149,8 +182,7 @@ def resume(
     from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli.study_results import contains_study, continue_study_and_exit
-    from marsyard.cli.until_decided import continue_until_decided
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
 
     if trust:
         adopt(directory)
@@ -166,7 +198,7 @@ def resume(
         resume_campaign(
             directory, executor, observer, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed
         )
-        continue_until_decided(directory, executor, observer)
+        _continue_until_decided(directory, executor, observer)
 
     run_and_evaluate(directory, continue_campaign)
 
@@ -192,7 +224,7 @@ def append(
     from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_definition
     from marsyard.cli.estimate import print_limits
-    from marsyard.cli.study_results import contains_study, continue_study_and_exit
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
 
     if trust:
         adopt(directory)

@@ -1,21 +1,22 @@
 """Commands `marsyard list` and `show`: the built-in campaigns, and the contents of one."""
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Option
 
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.options import CampaignArgument, JsonOption, SetOption
+from marsyard.cli.terminal import create_console
 
 
 @handle_user_errors
 def list_campaigns(as_json: JsonOption = False) -> None:
     """List the built-in campaigns."""
+    import tomllib
+
     from rich.table import Table
     from rich.text import Text
 

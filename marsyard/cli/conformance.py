@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.options import JsonOption
+from marsyard.cli.terminal import create_console
 
 
 @handle_user_errors

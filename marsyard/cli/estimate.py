@@ -7,7 +7,7 @@ import typer
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.estimate import estimate_campaign
-from marsyard.cli.console import size_text
+from marsyard.cli.terminal import size_text
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size
 from marsyard.reports.verdicts import ESTIMATE

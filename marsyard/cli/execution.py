@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import Exit
+from marsyard.cli.terminal import create_console
 
 if TYPE_CHECKING:
     from marsyard.campaigns.execution.executors import ExecutorConfig
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
     """Create the parameters of the workers from the options `--jobs` and `--cluster`."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.execution.executors import ExecutorConfig
-    from marsyard.campaigns.execution.machine_resources import available_cores
+    from marsyard.campaigns.execution.executors import ExecutorConfig, available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
@@ -36,7 +35,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
 def run_and_evaluate(directory: Path, work: Callable[[ProgressObserver], None]) -> None:
     """Run the campaign by the function `work`, evaluate it, and exit with the status of its verdict."""
     from marsyard.cli.outcome import evaluate_and_report
-    from marsyard.cli.run_log import RunLog
+    from marsyard.cli.progress import RunLog
 
     with show_progress(directory) as progress, RunLog(directory, progress) as log:
         work(log)

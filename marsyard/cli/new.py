@@ -1,11 +1,12 @@
-"""Command `marsyard new`: create a campaign file from options or questions."""
+"""Commands `marsyard new` and `ingest`: create a campaign from options or questions, or from recorded images."""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,36 +15,36 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli.errors import handle_user_errors
-from marsyard.cli.option_classes import with_options
 from marsyard.cli.options import OverwriteOption
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
+#: Name of the campaign file that `marsyard ingest` writes.
+CAMPAIGN_FILE = "campaign.toml"
 
 
-@dataclass(frozen=True)
-class NewOptions:
-    """Arguments and options of `marsyard new`."""
-
-    name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
+@handle_user_errors
+def new(
+    name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
     system: Annotated[
         str | None,
         Option(help="Type of the system under test, such as velocity, tracking or landing; an unknown one lists all."),
-    ] = None
-    site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
+    ] = None,
+    site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None,
     camera: Annotated[
         str | None,
         Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md); by default a camera of the system."),
-    ] = None
-    detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
+    ] = None,
+    detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None,
     flight: Annotated[
         str | None,
         Option(
             metavar="FILE", help="Recorded trajectory (docs/custom-worlds.md); by default the dynamics are simulated."
         ),
-    ] = None
-    axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
+    ] = None,
+    axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu",
     bound: Annotated[
         float | None,
         Option(
@@ -51,15 +52,11 @@ class NewOptions:
             help="Limit of the requirement: maximum error of the velocity (m/s) or of the tracked position (m), or "
             "minimum fraction of selected landing sites that are safe.",
         ),
-    ] = None
-    cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
-    out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None
-    overwrite: OverwriteOption = False
-
-
-@handle_user_errors
-@with_options(NewOptions)
-def new(arguments: NewOptions) -> None:
+    ] = None,
+    cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
+    out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
     """Write a campaign file with comments; ask for missing options when run interactively."""
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.estimate import evidence_limits
@@ -68,15 +65,14 @@ def new(arguments: NewOptions) -> None:
     from marsyard.scenarios.template import Choices
     from marsyard.sim.terrain import sites
 
-    name = arguments.name
-    path = Path(f"{name}.toml") if arguments.out is None else arguments.out
-    if path.exists() and not arguments.overwrite:
+    path = Path(f"{name}.toml") if out is None else out
+    if path.exists() and not overwrite:
         raise CampaignError(f"{path}: the file exists; use --overwrite to replace it, or --out to write another file")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is not a valid campaign name: slashes and quotes are not allowed")
-    is_interactive, available = arguments.system is None and _is_terminal(), templates()
+    is_interactive, available = system is None and _is_terminal(), templates()
     find_problem = partial(_find_name_problem, list(available))
-    system = arguments.system or _ask_user("System", next(iter(available)), is_interactive, find_problem)
+    system = system or _ask_user("System", next(iter(available)), is_interactive, find_problem)
     if system not in available:
         raise CampaignError(f"--system: {unknown_name_message('system', system, available)}")
     template = available[system]
@@ -84,17 +80,17 @@ def new(arguments: NewOptions) -> None:
         is_interactive and option not in template.unsupported_options for option in ("camera", "flight")
     )
     names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
-    site = arguments.site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
+    site = site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
     question = "Camera file (empty: the paper's camera)"
-    camera = arguments.camera or _ask_user(question, "", ask_camera, _find_camera_problem)
-    flight = arguments.flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)
+    camera = camera or _ask_user(question, "", ask_camera, _find_camera_problem)
+    flight = flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
-    bound = math.nan if arguments.bound is None else arguments.bound
+    bound = math.nan if bound is None else bound
     if math.isnan(bound):
         bound = float(_ask_user(question, default, is_interactive, partial(_find_number_problem, template.max_bound)))
-    choices = Choices(name, site, camera, arguments.detector or "", flight, arguments.axes, bound, arguments.cases)
+    choices = Choices(name, site, camera, detector or "", flight, axes, bound, cases)
     campaign = _write_and_load(path, template, choices)
-    summary = f"{path}: {system} over {site}, {count(arguments.cases, 'case')}"
+    summary = f"{path}: {system} over {site}, {count(cases, 'case')}"
     typer.echo(f"{summary}. To show it: `marsyard show {path}`. To run it:\n  marsyard run {path}")
     for limit in evidence_limits(campaign):
         typer.echo(f"note: {limit}")
@@ -169,3 +165,55 @@ def _find_number_problem(limit: float, answer: str) -> str:
         number = 0.0
     upper_limit = "" if limit == math.inf else f" and below {limit:g}"
     return "" if 0.0 < number < limit else f"'{answer}' is not allowed; allowed: a number above 0{upper_limit}"
+
+
+@handle_user_errors
+def ingest(
+    folder: Annotated[
+        Path,
+        Argument(metavar="FOLDER", help="Folder with ingest.toml, images.csv and the images (docs/real-images.md)."),
+    ],
+    out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
+    system: Annotated[
+        str | None,
+        Option(
+            help="System of an installed package whose importer reads the folder; by default the built-in importer, "
+            "for the task that ingest.toml states: velocity, landing, matching or map."
+        ),
+    ] = None,
+) -> None:
+    """Create a campaign from recorded images with measured poses, or over a map."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
+    from marsyard.reports.wording import count
+    from marsyard.scenarios.imports import import_object
+    from marsyard.scenarios.systems import systems
+
+    importers = {candidate.name: candidate.ingest for candidate in systems() if candidate.ingest}
+    name = system or next(iter(importers))
+    if name not in importers:
+        raise CampaignError(f"--system: {unknown_name_message('system', name, importers)}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"{out} exists and is not empty; give a new folder with --out")
+    partial_folder = out.with_name(f"{out.name}.part{os.getpid()}")
+    try:
+        with report_write_errors(f"{out}:"):
+            partial_folder.mkdir(parents=True)
+            ingested: Ingested = import_object(importers[name])(folder, partial_folder, out.resolve())
+            (partial_folder / CAMPAIGN_FILE).write_text(ingested.campaign, encoding="utf-8")
+            if out.exists():
+                out.rmdir()
+            partial_folder.rename(out)
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
+    finally:
+        shutil.rmtree(partial_folder, ignore_errors=True)
+    try:
+        load_campaign(str(out / CAMPAIGN_FILE))
+    except CampaignError:  # remove a campaign that cannot be run
+        shutil.rmtree(out)
+        raise
+    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.images, 'image')}: {out}")
+    if ingested.note:
+        typer.echo(ingested.note)
+    typer.echo(f"to run the cases: marsyard run {out / CAMPAIGN_FILE}")

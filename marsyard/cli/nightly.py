@@ -7,9 +7,9 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.execution import make_executor, stop_on_signals
+from marsyard.cli.terminal import create_console
 
 
 @handle_user_errors
@@ -28,15 +28,14 @@ def nightly(
     run; otherwise 3 if a requirement is undecided; otherwise 0.
     """
     from marsyard.campaigns.errors import report_write_errors
+    from marsyard.campaigns.store.git_history import git_commit
     from marsyard.campaigns.store.lock import folder_lock
-    from marsyard.campaigns.store.machine import git_commit
     from marsyard.cli import nightly_run
-    from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress
     from marsyard.reports.nightly import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
 
-    path = plan or PLAN_FILE
-    plan_definition, executor = read_plan(path), make_executor(jobs, None)
+    path = plan or nightly_run.PLAN_FILE
+    plan_definition, executor = nightly_run.read_plan(path), make_executor(jobs, None)
     with report_write_errors(out):
         (out / nightly_run.RUNS).mkdir(parents=True, exist_ok=True)
     with folder_lock(out), History(out / nightly_run.HISTORY_FILE) as history:

@@ -1,5 +1,9 @@
-"""One night of `marsyard nightly`: run the campaigns and checks of the plan, and write the page and the dashboard."""
+"""One night of `marsyard nightly`: read the plan, run its campaigns and checks, and write page and dashboard."""
 
+from __future__ import annotations
+
+import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -8,25 +12,98 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import typer
+from pydantic import Field, model_validator
 
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import MAX_CASES
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.toml_models import read_table
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.cli.errors import Exit
-from marsyard.cli.nightly_plan import Plan, PlannedCampaign, PlannedCheck, hash_definition
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.nightly import History, MetricChange, NightCampaign, format_night_page, list_comparisons
+from marsyard.sim.parameters import Parameters
+
+#: The plan that is installed with Marsyard.
+PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
 
 #: Files and folders in the output folder of `marsyard nightly`.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
 #: Verdict of a campaign that could not be run.
 NOT_RUN = "NOT RUN"
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class PlannedCampaign(Parameters):
+    """One campaign of the plan, with values that override its campaign file."""
+
+    campaign: Annotated[str, Field(min_length=1)]
+    cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = None
+    override: Texts = Field(default=(), alias="set")
+    algorithms: Texts = ()
+
+    def load(self, seed: int, night: int, folder: Path) -> Campaign:
+        """Load the campaign with the root seed of a night; relative paths start in `folder`, the folder of the plan."""
+        path = folder / self.campaign
+        name = str(path) if path.is_file() else self.campaign
+        return load_campaign(name, self.override, self.cases, night_seed(seed, night), self.algorithms)
+
+
+class PlannedCheck(Parameters):
+    """A program to run each night after the campaigns, in the folder of the plan: speed benchmarks, for example."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][\w.-]*$", description="name on the page, and of its log file")]
+    command: Annotated[tuple[str, ...], Field(strict=False, min_length=1, description="program and its arguments")]
+    time_limit_s: Annotated[float, Field(gt=0.0)] = 3600.0
+
+
+class Plan(Parameters):
+    """Plan of the campaigns and checks to run each night, read from a TOML file."""
+
+    seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
+        default=0, description="seed from which the root seed of each night is derived: each night draws new cases"
+    )
+    campaigns: Annotated[tuple[PlannedCampaign, ...], Field(strict=False, min_length=1)]
+    checks: Annotated[tuple[PlannedCheck, ...], Field(strict=False)] = ()
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Plan:
+        names = [entry.campaign for entry in self.campaigns]
+        if len(set(names)) < len(names):
+            raise ValueError("the plan contains a campaign twice; copy it to a second file with another name")
+        if len({check.name for check in self.checks}) < len(self.checks):
+            raise ValueError("the name of a check is used twice")
+        return self
+
+
+def read_plan(path: Path) -> Plan:
+    """Read the plan from a file. Raises DefinitionError if the file is not readable or not valid."""
+    return read_table(path, Plan)
+
+
+def night_seed(seed: int, night: int) -> int:
+    """Derive the root seed of a night (56 bits) by hashing the plan's seed and the night's number."""
+    digest = hashlib.sha256(f"{seed}:{night}".encode()).digest()
+    return int.from_bytes(digest[:7], "little")
+
+
+def hash_definition(campaign: Campaign) -> str:
+    """Hash a campaign's definition; only nights with equal definitions are compared.
+
+    Seed, description, retained products, limits and number of cases are excluded.
+    """
+    excluded_keys = {"seed", "description", "retain", "limits", "cases"}
+    definition = campaign.definition.model_dump(mode="json", exclude=excluded_keys)
+    return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)

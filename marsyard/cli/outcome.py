@@ -9,13 +9,13 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.errors import report_write_errors
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
-from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
+from marsyard.campaigns.store.table import refresh_table
 from marsyard.cli.errors import Exit
-from marsyard.cli.tables import grid_table
+from marsyard.cli.terminal import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
@@ -26,7 +26,6 @@ from marsyard.reports.robustness_section import robustness_text
 from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count
-from marsyard.sim.files import report_damage
 
 Requirements: TypeAlias = Sequence[Mapping[str, Any]]
 
@@ -98,12 +97,3 @@ def _comparison_tables(frame: pd.DataFrame, requirements: Requirements, verdicts
     titles = ("Algorithms on the same cases", f"Compared with {algorithms[0].name}")
     grids = zip(titles, comparison_grids(algorithms, differences, metric), strict=True)
     return [grid_table(title, grid) for title, grid in grids if grid.rows]
-
-
-def read_frame(directory: Path) -> pd.DataFrame:
-    """Read the stored rows of a campaign. Raises StoreError if there is no table."""
-    path = directory / TABLE_FILE
-    if not path.is_file():
-        raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
-    with report_damage(path, StoreError, "is not a valid table of cases"):
-        return pd.read_parquet(path)

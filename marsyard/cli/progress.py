@@ -1,16 +1,22 @@
-"""Progress of a running campaign: bars with rate and remaining time on a terminal, text lines otherwise.
+"""Progress of a running campaign: bars or text lines on the terminal, and the log file `run.log`.
 
 The public classes implement the protocol `ProgressObserver` of `marsyard.campaigns.running.progress`.
 """
 
 from __future__ import annotations
 
+import platform
+import shlex
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import timedelta
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
@@ -21,6 +27,9 @@ if TYPE_CHECKING:
 
 #: Time between two progress lines of a stage, seconds.
 LINE_INTERVAL_S = 10.0
+LOG_FILE = "run.log"
+#: Time between two lines of a stage in the log, seconds.
+LOG_INTERVAL_S = 60.0
 
 
 def remaining_s(done: int, total: int, elapsed_s: float) -> float:
@@ -130,3 +139,52 @@ def campaign_progress(console: Console) -> Iterator[ProgressObserver]:
     progress = BarProgress(console)
     with progress.bars:
         yield progress
+
+
+class RunLog:
+    """Observer that writes `run.log` and forwards each call to `observer`; errors in writing the log are ignored."""
+
+    def __init__(self, directory: Path, observer: ProgressObserver) -> None:
+        self._path, self._observer = directory / LOG_FILE, observer
+        self._stage, self._total, self._done = "", 0, 0
+        self._start_s, self._last_write_s, self._has_entries = time.monotonic(), 0.0, False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _traceback: TracebackType | None
+    ) -> None:
+        if not self._has_entries:
+            return  # the campaign did not start, and the folder may belong to another campaign
+        duration = f"{time.monotonic() - self._start_s:.1f} s"
+        reason = "" if kind is None else f", {self._stage}: {self._done}/{self._total}: {kind.__name__}: {error}"
+        self._write(f"{'stopped' if reason else 'ended'} after {duration}{reason}")
+
+    def begin(self, stage: str, total: int) -> None:
+        """Log the start of a stage."""
+        self._stage, self._total, self._done = stage, total, 0
+        self._write(f"{stage}: {total}")
+        self._observer.begin(stage, total)
+
+    def step(self) -> None:
+        """Count a step; log the progress at intervals."""
+        self._done += 1
+        if self._done == self._total or time.monotonic() - self._last_write_s > LOG_INTERVAL_S:
+            self._write(f"{self._stage}: {self._done}/{self._total}")
+        self._observer.step()
+
+    def note(self, text: str) -> None:
+        """Log a note."""
+        self._write(f"note: {text}")
+        self._observer.note(text)
+
+    def _write(self, text: str) -> None:
+        self._last_write_s, lines = time.monotonic(), [text]
+        if not self._has_entries:
+            self._has_entries = True
+            versions = f"marsyard {version('marsyard')}, Python {platform.python_version()}, {platform.platform()}"
+            lines = [f"session: {shlex.join(['marsyard', *sys.argv[1:]])}", versions, text]
+        utc = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        with suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.writelines(f"{utc} {' '.join(line.split())}\n" for line in lines)

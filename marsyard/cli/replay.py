@@ -1,19 +1,20 @@
-"""Command `marsyard replay`: run one case again."""
+"""Command `marsyard replay`: run one case again, and export it in space and time."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
 from marsyard.cli.errors import Exit, handle_user_errors
-from marsyard.cli.timeline_exports import list_exports, write_exports
 
-if TYPE_CHECKING:
-    pass
+#: Required package, and suffix of the file (a folder without one), of each option that exports a case.
+_EXPORTS = {"--rerun": ("rerun", ".rrd"), "--glb": ("trimesh", ".glb"), "--rosbag": ("rosbags", "")}
 
 
 @handle_user_errors
@@ -45,12 +46,17 @@ def replay(
     """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.campaigns.store.packed_products import pack_products, replace_files, unpack_products, write_packed
-    from marsyard.campaigns.store.products import case_directory
-    from marsyard.campaigns.store.stages import write_stages
+    from marsyard.campaigns.store.products import (
+        case_directory,
+        pack_products,
+        replace_files,
+        unpack_products,
+        write_packed,
+        write_stages,
+    )
     from marsyard.reports.presentation import write_case_figures
 
-    exports = list_exports(rerun, glb, rosbag)
+    exports = _check_exports({"--rerun": rerun, "--glb": glb, "--rosbag": rosbag})
     if trust:
         adopt(directory)
     result = rerun_case(directory, case)
@@ -82,6 +88,53 @@ def replay(
     else:
         typer.echo("the row equals the stored one")
     if exports:
-        write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
+        _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
     if result.stored is not None and result.differing:
         raise typer.Exit(Exit.FAILED)
+
+
+def _check_exports(targets: Mapping[str, Path | None]) -> dict[str, Path]:
+    """Return the files of the requested exports by option, before the case runs.
+
+    Raises CampaignError for a missing package or an unsuitable path.
+    """
+    from marsyard.campaigns.errors import CampaignError
+
+    exports = {option: target for option, target in targets.items() if target is not None}
+    for option, target in exports.items():
+        package, suffix = _EXPORTS[option]
+        if suffix and target.suffix != suffix:
+            raise CampaignError(f"{option} {target}: allowed: a file with the suffix {suffix}")
+        if not suffix and target.exists():
+            raise CampaignError(f"{option} {target} exists; allowed: a new folder")
+        if not target.parent.is_dir():
+            raise CampaignError(f"{option} {target}: the folder {target.parent} does not exist")
+        if find_spec(package) is None:
+            raise CampaignError(f"{option} needs the package {package}: pip install 'marsyard[view]'")
+    return exports
+
+
+def _write_exports(exports: Mapping[str, Path], products: Mapping[str, Any], case: int) -> None:
+    """Write the timeline of a case. Raises CampaignError without one, and StoreError if a file cannot be written."""
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
+    from marsyard.scenarios.timeline import PRODUCT, Timeline
+
+    timeline = Timeline.from_products(products)
+    if timeline is None:
+        reason = products.get(PRODUCT, "its scenario records none, or the case did not finish")
+        raise CampaignError(f"{', '.join(exports)}: case {case} has no timeline: {reason}")
+    for option, target in exports.items():
+        with report_write_errors(target):
+            if option == "--rerun":
+                from marsyard.reports.timeline.rerun_file import write_rerun
+
+                write_rerun(target, timeline, f"case {case}")
+            elif option == "--glb":
+                from marsyard.reports.timeline.glb import write_glb
+
+                write_glb(target, timeline)
+            else:
+                from marsyard.reports.timeline.ros_bag import write_ros_bag
+
+                write_ros_bag(target, timeline)
+        typer.echo(f"{option.removeprefix('--')}: {target}")

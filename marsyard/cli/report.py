@@ -1,6 +1,9 @@
 """Commands `marsyard report`, `confirmations` and `compare`: evaluate stored campaigns."""
 
 import json
+import shutil
+import subprocess
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +12,12 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import handle_user_errors
+from marsyard.cli.terminal import create_console
+
+#: Browsers that can print pages, in order of preference, and the time limit of printing.
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+_PRINT_TIMEOUT_S = 600.0
 
 
 @handle_user_errors
@@ -37,26 +44,91 @@ def report(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store import record
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli import outcome, report_files
+    from marsyard.cli.outcome import evaluate_and_report
 
     if trust:
         adopt(directory)
     if gallery:
-        from marsyard.cli.gallery_cases import rerun_gallery_cases
-
-        rerun_gallery_cases(directory)
+        _rerun_gallery_cases(directory)
     applicable_requirements = None
     if requirements is not None:
         name = str(record.read(directory)["name"])
         applicable_requirements = select_applicable(read_requirements(requirements), name)
         if not applicable_requirements:
             raise CampaignError(f"{requirements}: no requirement lists the campaign '{name}' in its campaigns")
-    status = outcome.evaluate_and_report(directory, create_console(), applicable_requirements)
+    status = evaluate_and_report(directory, create_console(), applicable_requirements)
     if csv:
-        typer.echo(f"rows: {report_files.write_csv(directory)}")
+        typer.echo(f"rows: {_write_csv(directory)}")
     if pdf:
-        typer.echo(f"pdf: {report_files.print_page(directory)}")
+        typer.echo(f"pdf: {_print_page(directory)}")
     raise typer.Exit(status)
+
+
+def _rerun_gallery_cases(directory: Path) -> None:
+    """Rerun the candidates of the gallery without stored products and store their products; report rows that differ.
+
+    Raises CampaignError if the campaign's scenario or an algorithm cannot be imported.
+    """
+    from marsyard.campaigns.execution.workers import LocalExecutor
+    from marsyard.campaigns.running.replay import replay_in_executor
+    from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+    from marsyard.campaigns.store.products import case_directory, save_packed
+    from marsyard.campaigns.store.record import stored_definition
+    from marsyard.campaigns.store.table import stored_row
+    from marsyard.reports.gallery import gallery_candidates
+    from marsyard.reports.stored import read_run
+
+    run = read_run(directory)
+    missing = [case for case in gallery_candidates(run) if case not in run.stored_cases]
+    if not missing:
+        return
+    definition = stored_definition(directory)
+    load_stored_campaign(directory, definition)
+    with LocalExecutor(1) as workers:
+        for case in missing:
+            rerun = replay_in_executor(workers, definition, case, stored_row(directory, case))
+            if rerun.products is None or rerun.failed:
+                typer.echo(f"case {case}: rerun, but no images were produced")
+                continue
+            save_packed(case_directory(directory, case), rerun.products, rerun.row)
+            differences = f"; the new row differs in: {', '.join(rerun.differing)}" if rerun.differing else ""
+            typer.echo(f"case {case}: rerun for its images{differences}")
+
+
+def _write_csv(directory: Path) -> Path:
+    """Write all rows as CSV in batches, atomically."""
+    import pyarrow.csv as pa_csv
+    import pyarrow.parquet as pq
+
+    from marsyard.campaigns.errors import report_write_errors
+    from marsyard.campaigns.store.table import TABLE_FILE
+    from marsyard.campaigns.store.temporary_files import replace_file
+
+    path = directory / "cases.csv"
+    with report_write_errors(path), replace_file(path) as partial_path:
+        table = pq.ParquetFile(directory / TABLE_FILE)
+        with pa_csv.CSVWriter(partial_path, table.schema_arrow) as writer:
+            for batch in table.iter_batches():
+                writer.write_batch(batch)
+    return path
+
+
+def _print_page(directory: Path) -> Path:
+    """Print the report page `report.html` to `report.pdf` with a headless browser; return the path of the PDF."""
+    from marsyard.campaigns.errors import CampaignError
+
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        raise CampaignError(f"--pdf requires a browser; install chromium ({', '.join(_BROWSERS)})")
+    target, page = ((directory / name).resolve() for name in ("report.pdf", "report.html"))
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
+        command += ["--no-pdf-header-footer", f"--print-to-pdf={target}", page.as_uri()]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=_PRINT_TIMEOUT_S)  # noqa: S603
+        except (subprocess.SubprocessError, OSError) as error:
+            raise CampaignError(f"{browser} failed to print {target}: {error}") from error
+    return target
 
 
 @handle_user_errors
@@ -69,7 +141,7 @@ def confirmations(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.confirmation_record import read_record
     from marsyard.campaigns.store.confirmations import create_record
-    from marsyard.campaigns.store.git_registration import find_registration_problem
+    from marsyard.campaigns.store.git_history import find_registration_problem
     from marsyard.reports.terminal_tables import confirmations_table
 
     if create:
@@ -97,7 +169,7 @@ def compare(
     The exit status is 0 even if the campaigns differ.
     """
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.cli.tables import grid_table
+    from marsyard.cli.terminal import grid_table
     from marsyard.reports import campaign_diff
     from marsyard.reports.stored import read_run
 

@@ -11,16 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import exit_with_error
 from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument
-from marsyard.cli.terrain_image import write_terrain_image
+from marsyard.cli.terminal import create_console
 
 if TYPE_CHECKING:
-    from marsyard.sim.terrain.imported import RealExtent
+    from marsyard.sim.terrain import Surface
+    from marsyard.sim.terrain.imported import EmbeddedDtm, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.statistics import TerrainStatistics
 
+#: Nadir image: maximum side length, pixels; colours (blue, green, red) of filled holes and of the outline of a DTM.
+MAX_SIDE_PX = 2048
+HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
 
 app = typer.Typer(no_args_is_help=True, help="List sites and print statistics of their terrain.")
 
@@ -80,7 +83,7 @@ def stats(
         grid_north = None if source is None else grid_north_deg(source.dtm)
         surface = synthesise(parameters, np.random.default_rng(seed))
         if image is not None:
-            write_terrain_image(image, surface, dtm)
+            _write_image(image, surface, dtm)
     except ValueError as error:
         exit_with_error(error)
     statistics = terrain_statistics(surface, None if dtm is None else dtm.real_samples(parameters.samples))
@@ -104,6 +107,42 @@ def stats(
         "grid_north_deg": grid_north,
     }
     typer.echo(json.dumps(record, indent=2))
+
+
+def _write_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -> None:
+    """Write a shaded nadir image of a terrain as PNG, grid north up; mark a DTM's outline and filled holes.
+
+    Raises ValueError if the file exists or cannot be written.
+    """
+    import cv2
+    import numpy as np
+
+    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
+
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"--image {path}: the file name must end in .png")
+    if path.exists():
+        raise ValueError(f"--image {path}: exists; choose another name")
+    side = len(surface.levels[0])
+    level = max(int(np.ceil(np.log2(side / MAX_SIDE_PX))), 0)
+    # light from the north-west, as usual for shaded relief
+    shaded = render_nadir_image(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
+    # scale the brightness; the brightest 0.2 % of the pixels are saturated
+    grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
+    image = np.repeat(grey[..., None], 3, axis=2)
+    if dtm is not None:
+        step = 2**level
+        holes = dtm.filled_samples(side)[::step, ::step]
+        image[holes] = (0.4 * image[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
+        south_west = dtm.columns.start // step, dtm.rows.start // step
+        north_east = dtm.columns.stop // step, dtm.rows.stop // step
+        cv2.rectangle(image, south_west, north_east, OUTLINE_COLOUR, 1)
+    try:
+        is_written = cv2.imwrite(str(path), image[::-1])
+    except cv2.error as error:
+        raise ValueError(f"--image {path}: cannot be written ({error})") from error
+    if not is_written:
+        raise ValueError(f"--image {path}: cannot be written")
 
 
 def _print_statistics(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import Confirmation
 from marsyard.reports.assurance.argument import Element, ElementKind, GoalState, defeater, goal, number_elements
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.provenance import format_tested_algorithms

@@ -47,22 +47,6 @@ def test_run_prints_table_verdict_and_report(finished_run: Path) -> None:
     assert "\x1b" not in out + progress
 
 
-def test_report_evaluates_stored_rows(finished_run: Path) -> None:
-    (finished_run / "report.html").unlink()
-    result = marsyard("report", finished_run)
-    assert (result.status, result.err) == (3, "")
-    assert "verdict: INSUFFICIENT" in result.out
-    assert (finished_run / "report.html").exists()
-
-
-def test_replay_compares_with_the_stored_row(finished_run: Path, tmp_path: Path) -> None:
-    result = marsyard("replay", finished_run, 2, "--out", tmp_path / "products")
-    assert (result.status, result.err) == (0, "")
-    assert "case 2: SILENT" in result.out
-    assert "the row equals the stored one" in result.out
-    assert (tmp_path / "products" / "products.npz").exists()
-
-
 def test_replay_fails_if_the_row_differs(finished_run: Path, tmp_path: Path) -> None:
     (tmp_path / "campaign.json").write_bytes((finished_run / "campaign.json").read_bytes())
     frame = pd.read_parquet(finished_run / "cases.parquet")
@@ -76,6 +60,8 @@ def test_replay_fails_if_the_row_differs(finished_run: Path, tmp_path: Path) -> 
 def test_stages_are_saved_as_separate_files(finished_run: Path, tmp_path: Path) -> None:
     result = marsyard("replay", finished_run, 0, "--save-stages", "--out", tmp_path / "case")
     assert (result.status, result.err) == (0, "")
+    assert "case 0: VALID" in result.out
+    assert "the row equals the stored one" in result.out
     stages = tmp_path / "case" / "stages"
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
     assert files == ["01-image.png", "02-title.json", "03-nested/01-0/01-x.npy"]
@@ -159,7 +145,9 @@ def test_exit_status_follows_verdict_and_crashes(
     path = write_campaign(tmp_path, parameters, dispersions="", requirement=requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
     assert (result.status, f"verdict: {verdict}" in result.out) == (status, True), result.out + result.err
+    (tmp_path / "run" / "report.html").unlink()
     report_result = marsyard("report", tmp_path / "run")
+    assert (tmp_path / "run" / "report.html").exists()
     assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
@@ -181,9 +169,7 @@ def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["run", "{file}", "--seed", "-1"], "--seed -1: seed: input should be greater than or equal to 0"),
         (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
         (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
-        (["run", "{file}", "--set", "altitud_m=2"], "unknown key (did you mean 'altitude_m'?)"),
         (["run", "dimes-smoke", "--set", "descent.altitud_first_m=1500"], "(did you mean 'altitude_first_m'?)"),
-        (["run", "dimes-smoke", "--set", "descent.altitude_first_m=-5"], "descent.altitude_first_m: "),
         (["run", "dimes-smoke", "--set", "render.backend=vulkan"], "osmesa"),
         (["run", "{file}", "--out", "{run}"], "contains a campaign"),
         (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
@@ -199,7 +185,7 @@ def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["append", "{folder}", "3"], "does not contain a campaign"),
         (["run"], "Missing argument"),
         (["run", "{file}", "--job", "1"], "No such option"),
-        (["fly"], "No such command 'fly'"),
+        (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
         (["show", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["report", "{folder}/none"], "none: no such folder"),
         (["report", "{folder}"], "does not contain a campaign"),
@@ -234,17 +220,6 @@ def test_default_output_folder_is_runs(tmp_path: Path, monkeypatch: pytest.Monke
     folders = sorted(path.name for path in (tmp_path / "runs").iterdir())
     assert len(folders) == 2
     assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
-
-
-def test_list_and_show_print_campaigns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "120")  # wide enough for unbroken texts
-    list_result = marsyard("list")
-    assert (list_result.status, list_result.err) == (0, "")
-    assert "dimes-smoke" in list_result.out
-    show_result = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
-    assert (show_result.status, show_result.err) == (0, "")
-    for text in ("uniform(low=-30.0, high=30.0)", "test", "lowest_altitude_m", "velocity", "12 cases, seed 5"):
-        assert text in show_result.out
 
 
 def test_names_in_brackets_are_not_markup(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
-"""Tests of the list of commands: help texts, JSON options, and the exit statuses and commands of the documentation."""
+"""Tests of all commands: help texts, JSON options, exit statuses and commands of the documentation, completion."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.cli.errors import Exit
@@ -23,7 +25,8 @@ WRITING = {
 
 
 def walk_commands(group: TyperGroup, prefix: str = "") -> Iterator[tuple[str, TyperCommand]]:
-    for name, command in group.commands.items():
+    for name in group.list_commands(typer.Context(group)):
+        command = group.get_command(typer.Context(group), name)
         if isinstance(command, TyperGroup):
             yield from walk_commands(command, f"{prefix}{name} ")
         elif isinstance(command, TyperCommand):
@@ -60,3 +63,22 @@ def test_page_has_an_example_of_every_command() -> None:
     named = set(re.findall(r"`marsyard (terrain \w+|\w+)", PAGE))
     # `terrain list` has no table row of its own: `terrain stats` stands for both
     assert set(list_commands()) - named == {"terrain list"}
+
+
+@pytest.mark.parametrize(
+    ("command_line", "word_index", "completions"),
+    [("marsyard confo", 1, {"conformance"}), ("marsyard clean --y", 2, {"--yes"}), ("marsyard terrain l", 2, {"list"})],
+)
+def test_words_are_completed(command_line: str, word_index: int, completions: set[str]) -> None:
+    environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": command_line, "COMP_CWORD": str(word_index)}
+    result = CliRunner().invoke(app, [], prog_name="marsyard", env=environment)
+    assert set(result.output.split()) == completions
+
+
+def test_installation_writes_the_shell_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("typer._completion_shared._get_shell_name", lambda: "bash")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    result = CliRunner().invoke(app, ["--install-completion"], prog_name="marsyard")
+    assert result.exit_code == 0, result.output
+    assert "marsyard" in (tmp_path / ".bashrc").read_text()
+    assert "marsyard --install-completion" in PAGE

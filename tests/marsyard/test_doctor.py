@@ -106,25 +106,16 @@ def test_backend_with_wrong_depth_fails() -> None:
     assert selection.verdict is CheckResult.FAIL
 
 
-def test_package_from_another_folder_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    find_spec = importlib.util.find_spec
-
-    def find_shadowed_spec(name: str) -> ModuleSpec | None:
-        origin = str(tmp_path / "marsyard" / "__init__.py")
-        return ModuleSpec(name, None, origin=origin) if name == "marsyard" else find_spec(name)
-
-    monkeypatch.setattr(importlib.util, "find_spec", find_shadowed_spec)
+@pytest.mark.parametrize("has_init", [True, False])
+def test_package_from_another_folder_is_reported(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_init: bool
+) -> None:
+    spec = ModuleSpec("marsyard", None, origin=str(tmp_path / "marsyard" / "__init__.py") if has_init else None)
+    spec.submodule_search_locations = [str(tmp_path / "marsyard")]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: spec)
     check = next(doctor.check_shadowing())
     assert check.verdict is CheckResult.FAIL
     assert f"marsyard from {tmp_path / 'marsyard'}" in check.finding
-
-
-def test_folder_without_init_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "marsyard").mkdir()
-    spec = ModuleSpec("marsyard", None, is_package=True)
-    spec.submodule_search_locations = [str(tmp_path / "marsyard")]
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: spec)
-    assert str(tmp_path / "marsyard") in next(doctor.check_shadowing()).finding
 
 
 def test_conflicting_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from marsyard import site_gallery as gallery_command
-from marsyard.image_request import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 from marsyard.site_gallery import (
@@ -22,6 +21,7 @@ from marsyard.site_gallery import (
     map_to_grey,
     write_gallery,
 )
+from marsyard.site_images import ImageRequest
 from tests.command import marsyard
 
 

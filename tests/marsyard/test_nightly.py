@@ -11,7 +11,7 @@ import pytest
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
 from marsyard.cli import nightly_run
-from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
+from marsyard.cli.nightly_run import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 from tests.command import marsyard
 

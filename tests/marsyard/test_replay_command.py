@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.packed_products import load_products, pack_products, save_packed
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from tests.campaigns.fake_campaign import RecordingWatch, run, sign_folder, write_campaign
 from tests.command import run_command
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from marsyard.campaigns.store.packed_products import load_products
+from marsyard.campaigns.store.products import load_products
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.scenarios.timeline_recording import recording_timelines
@@ -81,7 +81,7 @@ def test_wrong_target_is_reported_before_the_case_runs(
 
 
 def test_missing_package_is_reported(stored_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.cli.timeline_exports.find_spec", lambda _name: None)
+    monkeypatch.setattr("marsyard.cli.replay.find_spec", lambda _name: None)
     status, output = run_command("replay", stored_run, 0, "--rerun", tmp_path / "case.rrd")
     assert status == 2
     assert "pip install 'marsyard[view]'" in " ".join(output.split())

@@ -18,7 +18,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
-from marsyard.cli.until_decided import run_until_decided
+from marsyard.cli.campaign import run_until_decided
 from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.gallery import gallery_candidates

@@ -1,18 +1,13 @@
 """Tests of `marsyard show`: dispersions, draws as table, figure and JSON, and invalid campaign files."""
 
-import copy
 import json
 import re
-import tomllib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.campaigns.fake_campaign import to_toml
 from tests.command import marsyard
 
 CAMPAIGN = """
@@ -132,74 +127,6 @@ def test_invalid_options_are_rejected(campaign: Path, arguments: list[str], mess
     assert (result.status, result.out) == (2, "")
     assert "Traceback" not in result.err
     assert message in result.err
-
-
-def _walk_paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Yield the paths (keys and indices) of all values in a document."""
-    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner_value in children:
-        yield (*path, key)
-        yield from _walk_paths(inner_value, (*path, key))
-
-
-_DOCUMENT = tomllib.loads(CAMPAIGN)
-_VALUE_PATHS = list(_walk_paths(_DOCUMENT))
-_MISSING = object()
-_random_values = st.recursive(
-    st.one_of(
-        st.booleans(),
-        st.integers(-(2**70), 2**70),
-        st.floats(),
-        st.text(max_size=8),
-        st.sampled_from(
-            ["random", "sobol", "grid", "normal", "poisson", "cauchy", "1 / terrain", "terrain - 4", "kind"]
-        ),
-    ),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text("abc.\"'", max_size=4), inner, max_size=3),
-    max_leaves=6,
-) | st.just(_MISSING)
-
-
-def _change_document(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
-    """Return a copy of the campaign with another value at a path; `_MISSING` removes the key."""
-    document = copy.deepcopy(_DOCUMENT)
-    table: Any = document
-    for part in path[:-1]:
-        table = table[part]
-    if value is _MISSING:
-        del table[path[-1]]
-    else:
-        table[path[-1]] = value
-    return document
-
-
-#: Keys that may report an error of another key: parameters limit dispersions, the design limits sizes.
-_REPORTING_KEYS = {
-    "correlations": ("correlations", "dispersions"),
-    "design": ("design", "cases"),
-    "dispersions": ("dispersions", "correlations", "cases"),
-    "parameters": ("parameters", "dispersions"),
-}
-
-
-@pytest.mark.slow
-@given(path=st.sampled_from(_VALUE_PATHS), value=_random_values)
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:
-    """One value of a valid file is replaced or removed: the file is shown or the error names that key."""
-    document = _change_document(path, value)
-    campaign.write_text("\n".join(f"{key} = {to_toml(entry)}" for key, entry in document.items()))
-    result = marsyard("show", campaign, "--draw", 2, "--json")
-    assert "Traceback" not in result.err, result.err
-    assert result.status in (0, 2)
-    if result.status == 2:
-        assert result.out == ""
-        assert str(campaign) in result.err
-        for line in result.err.splitlines():  # one line per problem
-            key = line.removeprefix("error: ").removeprefix(f"{campaign}: ")
-            assert key.startswith(_REPORTING_KEYS.get(str(path[0]), (str(path[0]),))), (path, value, result.err)
-    else:
-        json.loads(result.out)
 
 
 @given(text=st.binary(max_size=60) | st.text("[]{}=\"'.,abc123\n#\\", max_size=60).map(str.encode))

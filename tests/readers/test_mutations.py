@@ -33,7 +33,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.packed_products import load_products, pack_products, save_packed
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 from marsyard.reports.stored import read_run

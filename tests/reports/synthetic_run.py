@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marsyard.campaigns.store.packed_products import pack_products, save_packed
+from marsyard.campaigns.store.products import pack_products, save_packed
 
 VELOCITY: Mapping[str, Any] = {
     "id": "DIMES-VEL",

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marsyard.cli.console import create_console
 from marsyard.cli.outcome import evaluate_and_report
+from marsyard.cli.terminal import create_console
 from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
 from marsyard.reports.dashboard.entries import read_entries
 from marsyard.reports.decision import collect_evidence, evaluate_requirements

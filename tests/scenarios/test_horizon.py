@@ -7,7 +7,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from marsyard.image_request import ImageRequest
 from marsyard.scenarios.horizon import add_unresolved_rocks, horizon_relief
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene, process_renderer
@@ -16,7 +15,7 @@ from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import RockField, Surface, site
 from marsyard.sim.terrain.sites import Hill
-from marsyard.site_images import RenderedImage, render_images
+from marsyard.site_images import ImageRequest, RenderedImage, render_images
 from tests.sim.scenes import flat_ground
 
 LEVEL = flat_ground(64, 1.0)

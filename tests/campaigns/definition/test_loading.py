@@ -63,6 +63,10 @@ INVALID = {
         ("altitude_m = {distribution='gamma', a=-1}", "gamma is not defined for a = -1.0"),
         ("altitude_m = {distribution='gamma', a='x'}", "altitude_m.a: unknown parameter 'x'; allowed: aborting_cases"),
         ("altitude_m = {distribution='gamma', a=[1]}", "altitude_m.a: input should be a valid number"),
+        (
+            "'wind.east_m_s' = {distribution='poisson', mu=1e300}",
+            '"wind.east_m_s": poisson is not defined for mu = 1e+300',
+        ),
         ("altitude_m = 'uniform'", "dispersions.altitude_m: input should be a valid dictionary"),
         ("altitude_m = {low = 1}", "dispersions.altitude_m.distribution: required, but missing"),
         ("terrain = {distribution='integer', low=0, high=100000}", "includes 100000, which is not valid"),

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.case_rows import make_unfinished_row
+from marsyard.campaigns.execution.cases import make_unfinished_row
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
@@ -267,19 +267,6 @@ def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     # crashed_only_after names the earlier case; case 3 crashes in a fresh worker too
     assert [results[item].crashed_only_after for item in range(5)] == [None, 0, 1, None, None]
     assert [results[item].crashed for item in range(5)] == [False, False, False, True, False]
-
-
-def close_files(item: int) -> int:
-    if item == 1:
-        os.closerange(3, 1024)
-    return item
-
-
-@pytest.mark.slow
-def test_case_that_closes_worker_files_is_the_only_crashed_case() -> None:
-    results = run_items(close_files, range(4))
-    assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
-    assert list_results(results) == {0: 0, 2: 2, 3: 3}
 
 
 def share_memory(item: int) -> int:

@@ -19,7 +19,7 @@ from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import MAX_BATCH, Batches
 from marsyard.campaigns.execution.work import Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import StatusBoard, run_batch
+from marsyard.campaigns.execution.worker_process import run_batch
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT
 from tests.campaigns.execution.items import get_process_id, list_results, read_exit, run_items, sleep_and_return
@@ -222,15 +222,6 @@ def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
     slow_cases.record_time(1, 30.0)
     assert [len(slow_cases.next()) for _ in range(5)] == [1] * 5
     assert slow_cases.next() == []
-
-
-def test_status_board_shows_item(tmp_path: Path) -> None:
-    """A worker writes its current item to shared memory; None means idle."""
-    board = StatusBoard.create(tmp_path / "board")
-    assert board.read() is None
-    StatusBoard(tmp_path / "board").write(2**40)
-    assert board.read() == 2**40
-    board.close()
 
 
 def get_worker_number(_: int) -> str:

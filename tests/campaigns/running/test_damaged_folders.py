@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import typer
 
-from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, DefinitionError, StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.execution.workers import LocalExecutor
@@ -138,18 +137,3 @@ def test_full_disk_is_reported_without_traceback(capsys: pytest.CaptureFixture[s
         command()
     assert error.value.exit_code == 2
     assert capsys.readouterr().err == "error: [Errno 28] No space left on device: 'somewhere'\n"
-
-
-def test_invalid_site_and_distribution_are_reported_by_key(tmp_path: Path) -> None:
-    path = tmp_path / "campaign.toml"
-    path.write_text('name = "x"\nscenario = "landing"\ncases = 3\nseed = 1\n[parameters]\nsite = {a = 1}\n')
-    with pytest.raises(DefinitionError, match=r"parameters\.site: input should be a valid string"):
-        load_campaign(str(path))
-    path.write_text(
-        'name = "x"\nscenario = "descent"\ncases = 3\nseed = 1\n[dispersions]\n'
-        '"location.east_m" = {distribution = "poisson", mu = 1e300}\n'
-    )
-    with pytest.raises(
-        DefinitionError, match=r'dispersions\."location.east_m": poisson is not defined for mu = 1e\+300'
-    ):
-        load_campaign(str(path))

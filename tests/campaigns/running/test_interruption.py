@@ -64,19 +64,6 @@ def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_pa
     assert all(map(has_ended, workers))
 
 
-@pytest.mark.slow
-def test_workers_end_when_their_parent_is_killed(campaign_file: CampaignFile, tmp_path: Path) -> None:
-    process = _start_campaign(campaign_file(dispersions=""), tmp_path / "run")
-    workers = _find_workers(process)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    deadline = time.monotonic() + 10.0
-    while not all(map(has_ended, workers)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert len(workers) == 2
-    assert all(map(has_ended, workers))
-
-
 def _find_marked_processes(mark: str) -> list[int]:
     """Return the ids of running processes whose environment contains the text `mark`."""
     processes = []

@@ -11,9 +11,9 @@ import pytest
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.packed_products import load_products
+from marsyard.campaigns.store.product_selection import find_showcase, find_worst_cases
+from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
-from marsyard.campaigns.store.showcase import find_showcase, find_worst_cases
 from marsyard.campaigns.store.table import write_table
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
 

@@ -21,7 +21,7 @@ from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import lock, record, temporary_files
 from marsyard.campaigns.store.lock import folder_lock, is_locked
-from marsyard.campaigns.store.packed_products import load_products, pack_products, save_packed
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import numeric_metrics, read_rows, write_table
 

@@ -12,15 +12,12 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
-from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.sampling.study_points import NEW_STREAM, POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
-from marsyard.campaigns.studies.point_runner import Candidate
-from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
 from marsyard.campaigns.studies.results import SearchParameters
 from marsyard.campaigns.studies.runner import prepare_campaign
-from marsyard.campaigns.studies.search import start_search
-from marsyard.campaigns.studies.subset import NEW_STREAM
+from marsyard.campaigns.studies.search import start_search, write_regression_campaigns
 from marsyard.scenarios.systems import systems
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign
 
@@ -95,9 +92,10 @@ def test_terrain_follows_the_number_of_the_streams(tmp_path: Path) -> None:
     campaign = prepare_campaign(load_fake_campaign(tmp_path, 99_999), 20_000)
     # a new case, a case with blended streams (a step of a Markov chain), and a case with the streams of case 3
     first, blended, repeated = (
-        candidate.point(17) for candidate in (Candidate((0.0,)), Candidate((0.0,), blend=BLEND), Candidate((0.0,), 3))
+        point.with_numbers(17) for point in (StudyPoint((0.0,)), StudyPoint((0.0,), blend=BLEND), StudyPoint((0.0,), 3))
     )
     assert [campaign.draws_at(point)["terrain"] for point in (first, blended, repeated)] == [17, 17, 3]
+    assert blended.blend == ((5, 0.8), (17, 0.6))
 
 
 def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:

@@ -13,9 +13,10 @@ from marsyard.campaigns.errors import CampaignError, DefinitionError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
+from marsyard.campaigns.studies.budget import start_budget
 from marsyard.campaigns.studies.rare import continue_rare, start_rare
 from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
-from marsyard.campaigns.studies.results import RareParameters, RareResult
+from marsyard.campaigns.studies.results import BudgetParameters, RareParameters, RareResult, SearchParameters
 from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
@@ -137,13 +138,6 @@ def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_
     assert counting.cases == result.decision.counting.cases + 30
 
 
-def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaign_path: Path, tmp_path: Path) -> None:
-    parameters = RareParameters("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,), random_cases=(0,))
-    result = run_study(campaign_path, tmp_path / "run", parameters)
-    assert result.verdict is RareVerdict.INSUFFICIENT
-    assert result.exit_code == 3
-
-
 @pytest.mark.slow
 def test_finished_study_is_protected(finished_study: Path) -> None:
     """Commands of campaigns, another program, and results without a counting bound, which an earlier version wrote."""
@@ -163,23 +157,37 @@ def test_finished_study_is_protected(finished_study: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("requirement", "changes", "message"),
+    ("kind", "values", "message"),
     [
-        ("LOADS", {}, "did you mean 'LOAD'"),
-        ("FLAG", {}, "only true or false"),
-        ("LOAD", {"samples": 10}, "--samples 10"),
-        ("LOAD", {"method": "guess"}, "--method guess: allowed: subset, importance"),
-        ("LOAD", {"random_cases": (-1,)}, "--random-cases -1: at least 0"),
-        ("LOAD", {"replicates": (1,)}, "--replicates 1: at least 2"),
-        ("LOAD", {"max_probability": 0.0}, "--max-probability"),
+        (RareParameters, {"samples": 10}, "--samples 10: at least 50"),
+        (RareParameters, {"method": "guess"}, "--method guess: allowed: subset, importance"),
+        (RareParameters, {"random_cases": (-1,)}, "--random-cases -1: at least 0"),
+        (RareParameters, {"replicates": (1,)}, "--replicates 1: at least 2"),
+        (RareParameters, {"max_probability": 0.0}, "--max-probability 0.0: allowed"),
+        (RareParameters, {"importance_cases": 49}, "--importance-cases 49: at least 50"),
+        (SearchParameters, {"cases": 19}, "--cases 19: at least 20"),
+        (SearchParameters, {"restarts": 0}, "--restarts 0: at least 1"),
+        (SearchParameters, {"max_failures": 0}, "--failures 0: at least 1"),
+        (BudgetParameters, {"cases": 19}, "--cases 19: at least 20"),
+        (BudgetParameters, {"sobol": 24}, "--sobol 24: allowed: 0, or a power of 2 from 16"),
+        (BudgetParameters, {"confidence": 1.0}, "--confidence 1.0: allowed"),
     ],
 )
-def test_invalid_settings_are_reported(
-    campaign_path: Path, tmp_path: Path, requirement: str, changes: dict[str, object], message: str
-) -> None:
-    values = {"requirement": requirement, "max_probability": 1e-2, **changes}
+def test_invalid_parameters_of_studies_are_reported(kind: type, values: dict[str, object], message: str) -> None:
+    valid = {"requirement": "LOAD"} | ({"max_probability": 1e-2} if kind is RareParameters else {})
     with pytest.raises(CampaignError, match=message):
-        run_study(campaign_path, tmp_path / "run", RareParameters(**values))  # type: ignore[arg-type]
+        kind(**valid | values)
+
+
+@pytest.mark.parametrize(("requirement", "message"), [("LOADS", "did you mean 'LOAD'"), ("FLAG", "only true or false")])
+def test_unsuitable_requirement_is_reported(
+    campaign_path: Path, tmp_path: Path, requirement: str, message: str
+) -> None:
+    campaign, executor = load_campaign(str(campaign_path)), ExecutorConfig(1)
+    with pytest.raises(CampaignError, match=message):
+        start_rare(campaign, RareParameters(requirement, 1e-2), 5000, tmp_path / "run", executor, RecordingWatch())
+    with pytest.raises(CampaignError, match=message):
+        start_budget(campaign, BudgetParameters(requirement), tmp_path / "run", executor, RecordingWatch())
     assert not (tmp_path / "run").exists()
 
 
@@ -214,27 +222,8 @@ def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_p
     run = '[[calibration.runs]]\noptions = ["beta"]\ncampaign = "limit-state"\nseed = 3'
     campaign_path.write_text(f"{CAMPAIGN}\n[calibration]\n\n{run}\n")
     result = run_study(campaign_path, tmp_path / "run")
-    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert (result.verdict, result.exit_code) == (RareVerdict.INSUFFICIENT, 3)
     assert result.decision.reason.startswith("The verdict would be PASS. Calibrated on these cases")
-
-
-def test_estimate_below_the_limit_is_no_pass(campaign_path: Path, tmp_path: Path) -> None:
-    """250 independent cases cannot exclude a violation at random in one of 1,000 cases, although the estimate does."""
-    parameters = RareParameters("LOAD", 1e-3, samples=100, replicates=(2,), random_cases=(50,))
-    result = run_study(campaign_path, tmp_path / "run", parameters, "beta=3.7")
-    assert result.verdict is RareVerdict.INSUFFICIENT
-    # 1 - 0.05^(1/250)
-    assert result.decision.counting.violations == 0
-    assert result.decision.counting.upper == pytest.approx(0.01191, rel=1e-3)
-
-
-def test_plateau_is_insufficient(campaign_path: Path, tmp_path: Path) -> None:
-    parameters = RareParameters("LOAD", 1e-3, samples=50, replicates=(2,), random_cases=(0,))
-    result = run_study(campaign_path, tmp_path / "run", parameters, "step=true")
-    assert result.verdict is RareVerdict.INSUFFICIENT
-    assert "2 of 2 replicates reached a plateau" in result.decision.reason
-    assert all(not item.reached for item in result.replicates)
-    assert result.decision.interval.upper == 1.0
 
 
 @pytest.mark.slow

@@ -263,19 +263,25 @@ def test_changed_rows_of_a_study_are_found(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("farthest", "message"),
+    ("arguments", "message"),
     [
-        ({"loads.0": 3.0}, "is dispersed, so that the stored cases give its robustness"),
-        ({"betta": 1.0}, "there is no parameter 'betta'"),
-        ({"step": 1.0}, "is False; allowed: parameters with a number"),
-        ({"beta": BETA}, "this is its value in the campaign"),
-        ({}, "there is nothing to change"),
+        (("--parameter", "loads.0=3"), "is dispersed, so that the stored cases give its robustness"),
+        (("--parameter", "betta=1"), "there is no parameter 'betta'"),
+        (("--parameter", "step=1"), "is False; allowed: parameters with a number"),
+        (("--parameter", f"beta={BETA}"), "this is its value in the campaign"),
+        (("--parameter", "beta=1", "-n", "20"), "--cases 20: at least 60"),
+        (("--variant", "lambert"), "--variant: unknown variant 'lambert'"),
+        (("--variant", "all"), "there is nothing to change"),
+        *(
+            (("--parameter", text), f"--parameter {text}: allowed: PATH=NUMBER")
+            for text in ("beta", "beta=", "beta=two", "beta=nan")
+        ),
     ],
 )
-def test_unsuitable_parameters_are_rejected(run: Path, farthest: dict[str, float], message: str) -> None:
-    with pytest.raises(CampaignError, match=message):
-        study(run, farthest)
-    assert not (run / "robust").exists()
+def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[str, ...], message: str) -> None:
+    result = CliRunner().invoke(app, ["robust", str(finished_run), *arguments])
+    assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
+    assert not (finished_run / "robust").exists()
 
 
 def test_invalid_value_of_a_variant_is_rejected(run: Path) -> None:
@@ -294,25 +300,6 @@ def test_study_is_no_run(run: Path) -> None:
     directory = study(run, {"beta": 1.0}, cases=60)
     with pytest.raises(CampaignError, match="its cases are not independent random draws"):
         study(directory, {"beta": 1.0})
-
-
-def test_unknown_variant_is_one_message(run: Path) -> None:
-    result = CliRunner().invoke(app, ["robust", str(run), "--variant", "lambert"])
-    assert result.exit_code == 2
-    assert "--variant: unknown variant 'lambert'" in result.output
-
-
-def test_too_few_cases_are_one_message(run: Path) -> None:
-    result = CliRunner().invoke(app, ["robust", str(run), "--parameter", "beta=1", "-n", "20"])
-    assert result.exit_code == 2
-    assert "--cases 20: at least 60" in result.output
-
-
-@pytest.mark.parametrize("text", ["beta", "beta=", "beta=two", "beta=nan"])
-def test_invalid_option_is_one_message(run: Path, text: str) -> None:
-    result = CliRunner().invoke(app, ["robust", str(run), "--parameter", text])
-    assert result.exit_code == 2
-    assert f"--parameter {text}: allowed: PATH=NUMBER" in result.output
 
 
 def test_variants_of_the_included_systems_are_valid() -> None:

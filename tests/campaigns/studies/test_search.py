@@ -14,7 +14,6 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies.point_runner import Candidate
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.results import SearchParameters, SearchResult
 from marsyard.campaigns.studies.runner import prepare_campaign
@@ -59,13 +58,12 @@ class DirectRunner:
     def __init__(self, campaign: Campaign) -> None:
         self.campaign, self.n_cases = campaign, 0
 
-    def run(self, candidates: Sequence[Candidate]) -> list[dict[str, object]]:
+    def run(self, points: Sequence[StudyPoint]) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []
-        for candidate in candidates:
-            stream = self.n_cases if candidate.stream is None else candidate.stream
-            point = StudyPoint(candidate.coordinates, stream, candidate.nominal)
+        for new_point in points:
+            point = new_point.with_numbers(self.n_cases)
             result = self.campaign.scenario.run(
-                self.campaign.with_values(self.campaign.draws_at(point)), self.campaign.streams(stream)
+                self.campaign.with_values(self.campaign.draws_at(point)), self.campaign.streams(point.stream)
             )
             rows.append({"outcome": result.outcome, "answered": True, **result.row, POINT_COLUMN: point.text})
             self.n_cases += 1
@@ -114,15 +112,6 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     assert data["verdict"] == "FAIL"
     assert data["sections"]["search"]["failures"][0]["values"].keys() == {"sun_deg", "yaw_deg"}
     assert "Reduced violations" in (killed_run / "report.html").read_text()
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [({"cases": 5}, "--cases 5"), ({"restarts": 0}, "--restarts 0"), ({"max_failures": 0}, "--failures 0")],
-)
-def test_invalid_settings_are_reported(parameters: dict[str, int], message: str) -> None:
-    with pytest.raises(CampaignError, match=message):
-        SearchParameters("VELOCITY", **parameters)
 
 
 def test_search_has_no_replicates_and_no_rates(campaign_path: Path, tmp_path: Path) -> None:

@@ -125,15 +125,6 @@ def test_separate_failure_regions_have_separate_densities() -> None:
     assert sorted(np.sign(density.centres[:, 0])) == [-1.0, 1.0]
 
 
-def test_too_few_violations_have_no_density() -> None:
-    assert fit_density(np.ones((9, 2))) is None
-
-
-def test_interval_needs_two_replicates() -> None:
-    with pytest.raises(ValueError, match="at least 2 replicates"):
-        replicate_interval([1e-4], 0.9)
-
-
 def test_more_replicates_are_needed_near_the_limit() -> None:
     interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], 0.9)
     near, far = (additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4))
@@ -142,6 +133,9 @@ def test_more_replicates_are_needed_near_the_limit() -> None:
     assert near > far >= 1
 
 
-def test_interval_without_violations_is_0_to_1() -> None:
+def test_too_few_results_give_no_density_and_no_interval() -> None:
+    assert fit_density(np.ones((9, 2))) is None
     interval = weighted_interval([0.0, 0.0, 0.0], 0.9)
     assert (interval.lower, interval.upper) == (0.0, 1.0)
+    with pytest.raises(ValueError, match="at least 2 replicates"):
+        replicate_interval([1e-4], 0.9)

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.campaigns.store.packed_products import pack_products, unpack_products
+from marsyard.campaigns.store.products import pack_products, unpack_products
 from marsyard.reports.timeline.figure import draw_timeline
 from marsyard.reports.timeline.glb import write_glb
 from marsyard.reports.timeline.mesh import camera_outlines, triangulate

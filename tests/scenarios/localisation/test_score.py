@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.campaigns.store.packed_products import pack_products
+from marsyard.campaigns.store.products import pack_products
 from marsyard.scenarios.localisation.figures import case_products
 from marsyard.scenarios.localisation.map_truth import MapTruth, SmoothField
 from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors

@@ -1,4 +1,4 @@
-"""Registration of a record of confirmations: git shows that no entry of it was removed.
+"""What git shows: the commit of the program, and that no entry of a record of confirmations was removed.
 
 A record is registered if it is committed to a git repository, and every version of a record in the history of all
 branches is a beginning of the present file. A record that was deleted, replaced or shortened after a commit is
@@ -9,17 +9,28 @@ import hashlib
 import os
 import shutil
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 from marsyard.campaigns.definition.campaign import CONFIRMATIONS_FILE
-from marsyard.campaigns.definition.loading import find_campaign
-from marsyard.campaigns.errors import CampaignError
 
-#: Beginning of each reason.
+#: Beginning of each reason why a record is not registered.
 UNKNOWN = "No record of earlier runs is known here"
+#: Time limit of one call of git, s.
 _TIMEOUT_S = 60.0
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
+
+
+def git_commit() -> str | None:
+    """Return the git commit of the program, with ``+changes`` if tracked files were edited; None if unknown."""
+    source = Path(__file__).resolve()
+    try:
+        if not _run_git(source.parent, "ls-files", source.name):
+            return None
+        commit = _run_git(source.parent, "rev-parse", "HEAD")
+        changes = _run_git(source.parent, "status", "--porcelain", "--untracked-files=no")
+    except (subprocess.SubprocessError, OSError):
+        return None
+    return f"{commit}+changes" if changes else commit
 
 
 def find_registration_problem(path: Path) -> str:
@@ -29,7 +40,7 @@ def find_registration_problem(path: Path) -> str:
     path = path.resolve()
     if path.name != CONFIRMATIONS_FILE:
         return f"{UNKNOWN}: {path} is not named {CONFIRMATIONS_FILE}."
-    if find_repository(path.parent) is None:
+    if _find_repository(path.parent) is None:
         return f"{UNKNOWN}: {path} is in no git repository."
     try:
         return _check_history(path)
@@ -40,18 +51,18 @@ def find_registration_problem(path: Path) -> str:
 def _check_history(path: Path) -> str:
     """Compare the committed versions of all records of the repository with the present content of a record."""
     folder = path.parent
-    if _git(folder, "rev-parse", "--is-shallow-repository") == "true":
+    if _run_git(folder, "rev-parse", "--is-shallow-repository") == "true":
         return f"{UNKNOWN}: the git repository is a shallow clone, without its history."
-    if not _git(folder, "ls-tree", "HEAD", "--", f"./{path.name}", check=False):
+    if not _run_git(folder, "ls-tree", "HEAD", "--", f"./{path.name}", check=False):
         return f"{UNKNOWN}: {path} is not committed."
     options = ("--all", "--full-history", "-m", "--raw", "--no-abbrev", "--no-renames", "--format=")
-    changes = _git(folder, "log", *options, "--", f":(top,glob)**/{CONFIRMATIONS_FILE}").splitlines()
-    # a line of `--raw`: modes and object names before and after the change, the kind of change, a tab, and the path
+    changes = _run_git(folder, "log", *options, "--", f":(top,glob)**/{CONFIRMATIONS_FILE}").splitlines()
     versions: dict[str, str] = {}
     for line in changes:
         fields, _, name = line.partition("\t")
-        versions.setdefault(fields.split()[3], name)
-    objects = _git(folder, "cat-file", "--batch-check", text="\n".join(versions)).splitlines()
+        _old_mode, _new_mode, _old_object, new_object, _kind = fields.split()  # a line of `--raw`
+        versions.setdefault(new_object, name)
+    objects = _run_git(folder, "cat-file", "--batch-check", text="\n".join(versions)).splitlines()
     content = path.read_bytes()
     for entry in objects:
         name, kind, *sizes = entry.split()
@@ -63,28 +74,23 @@ def _check_history(path: Path) -> str:
     return ""
 
 
-def find_campaign_file_problem(record: Path, command: Sequence[str]) -> str:
+def find_campaign_file_problem(record: Path, campaign_file: Path | None) -> str:
     """Describe that a campaign file belongs to another repository than the record; empty if it does not.
 
-    - command: words of the command that repeats the campaign; the third is the campaign
-
-    Campaigns of the catalogue may be confirmed in any repository.
+    Campaigns of the catalogue, and those without a file (None), may be confirmed in any repository.
     """
-    try:
-        path = find_campaign(command[2]).resolve() if len(command) > 2 else None
-    except CampaignError:
-        path = None
+    path = None if campaign_file is None else campaign_file.resolve()
     if path is None or path.is_relative_to(_PACKAGE_FOLDER / "scenarios"):
         return ""
-    if find_repository(path.parent) == find_repository(record.resolve().parent):
+    if _find_repository(path.parent) == _find_repository(record.resolve().parent):
         return ""
     return f"{UNKNOWN}: {path} is not in the git repository of {record}."
 
 
-def find_repository(folder: Path) -> str | None:
+def _find_repository(folder: Path) -> str | None:
     """Return the folder of the git repository that contains a folder; None without one, or without git."""
     try:
-        return _git(folder, "rev-parse", "--show-toplevel") or None
+        return _run_git(folder, "rev-parse", "--show-toplevel") or None
     except (subprocess.SubprocessError, OSError):
         return None
 
@@ -95,7 +101,7 @@ def _object_name(content: bytes, digits: int) -> str:
     return hashlib.new(algorithm, b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
 
 
-def _git(folder: Path, *arguments: str, text: str | None = None, check: bool = True) -> str:
+def _run_git(folder: Path, *arguments: str, text: str | None = None, check: bool = True) -> str:
     """Run git in a folder and return its output; variables that select another repository are ignored."""
     git = shutil.which("git")
     if git is None:
