@@ -360,3 +360,18 @@ def test_cloud_shadows_move_steadily_between_images() -> None:
     wind = np.hypot(parameters.wind_east_m_s, parameters.wind_north_m_s)
     assert np.ptp(velocities_m_s) < 0.01
     assert abs(velocities_m_s.mean() - wind) < 0.5
+
+
+def test_alternating_headings_reduce_the_effect_of_drift() -> None:
+    """If the platform turns with the heading, the effect of the drift changes its sign at each pass.
+
+    The tilt error then changes less between passes in the same direction. The fitted constant bias leaves a rest.
+    """
+    changes_deg = []
+    for turns_with_flight in (False, True):
+        run = make_ivanpah_run(helicopter={"turns_with_flight": turns_with_flight})
+        errors, numbers = compute_attitude_errors_deg(run)[:, :2], run.images.pass_number
+        means = np.array([errors[numbers == number].mean(axis=0) for number in np.unique(numbers)])
+        changes_deg.append(np.linalg.norm(means[2:] - means[:-2], axis=1).max())
+    assert changes_deg[0] > 0.4
+    assert changes_deg[1] < 0.7 * changes_deg[0]

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.systems import catalogue
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.descents import DESCENT, FLAT_TERRAIN, IDEAL_INSTRUMENTS, SMALL_WORLD, run_descent
 
@@ -18,34 +16,6 @@ from tests.scenarios.descent.descents import DESCENT, FLAT_TERRAIN, IDEAL_INSTRU
 def nominal_case() -> CaseResult:
     """Run case 0 of the descent over the small terrain without changes of its parameters."""
     return run_descent()
-
-
-@pytest.mark.slow
-def test_each_catalogue_dispersion_is_reported() -> None:
-    """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
-    draws = load_campaign("dimes-gusev").draws(3)
-    samples = {path: value for path, value in draws.items() if path != "location.terrain"}
-    values: dict[str, Any] = {
-        "location": dict(SMALL_WORLD["location"]),
-        "faults": {"exposure_delay_s": 0.25},
-        "site": "gusev",
-    }
-    values["terrain"] = dict(SMALL_WORLD["terrain"])
-    for path, value in samples.items():
-        *names, last = path.split(".")
-        table = values
-        for name in names:
-            table = table.setdefault(name, {})
-        table[last] = value
-    row = run_descent(**values).row
-    for path, value in samples.items():
-        parts = path.split(".")
-        column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
-        assert row[column] == pytest.approx(value, rel=1e-9), path
-    assert (row["fault"], row["fault_size"], row["terrain"]) == ("exposure_delay_s", 0.25, 0)
-    campaigns = [load_campaign(name).definition for name in catalogue()]
-    dispersed_paths = {path for entry in campaigns if entry.scenario == "descent" for path in entry.dispersions}
-    assert dispersed_paths == {*draws, "faults"}
 
 
 def test_velocity_error_is_estimate_minus_truth(nominal_case: CaseResult) -> None:

@@ -8,12 +8,13 @@ from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate
 from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.flight import LanderFlight
+from marsyard.scenarios.localisation.instruments import IMAGE_CLOCK
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.parameters import ImageSchedule
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
-from marsyard.sim.sensor import Imu
-from marsyard.sim.sensor.imu import LN200
+from marsyard.sim.sensor import Clock, Imu
+from marsyard.sim.sensor.imu import LN200, true_increments
 
 #: True start and end of the inertial data, s.
 SPAN_S = (0.0, 6.0)
@@ -135,3 +136,20 @@ def test_images_follow_the_schedule(flight: LanderFlight) -> None:
     assert times[-1] <= flight.end_s < times[-1] + schedule.interval_s
     np.testing.assert_array_equal(ImageSchedule(first_s=1.0).times(2.0, 8.0), [3.0, 6.3])
     assert ImageSchedule().times(0.0, 0.1).size == 0
+
+
+def test_measurements_contain_no_truth(flight: LanderFlight, increments: ImuIncrements) -> None:
+    """Time tags of increments and images have the errors of their clocks; no increment equals its true value."""
+    rng = np.random.default_rng(8)
+    true_times = ImageSchedule().times(0.0, flight.end_s)
+    assert np.all(Clock.draw(IMAGE_CLOCK, rng).tags(true_times, rng) != true_times)
+    # the constant offset of this unit's clock, from its drawn errors
+    unit = Imu.draw(LN200, SPAN_S, np.random.default_rng(4))
+    boundaries = unit.boundaries(*SPAN_S)
+    errors = increments.times_s - boundaries
+    assert unit.clock.offset_s != 0.0
+    assert errors.mean() == pytest.approx(unit.clock.offset_s, abs=4.0 * LN200.clock.jitter_sd_s / np.sqrt(errors.size))
+    assert errors.std() == pytest.approx(LN200.clock.jitter_sd_s, rel=0.1)
+    angles, velocities = true_increments(flight, boundaries)
+    assert np.all(increments.delta_angles_rad != angles)
+    assert np.all(increments.delta_velocities_m_s != velocities)

@@ -329,3 +329,23 @@ class LateEstimator:
     def finish(self) -> Any:
         """Answer without a position."""
         return PositionEstimate(PositionOutcome.UNCERTAIN, 1e6)
+
+
+def test_products_belong_to_the_row() -> None:
+    result = _nominal()
+    products, row = result.products, dict[str, Any](result.row)
+    assert products["track"].shape == (5, 7)
+    assert products["outcomes"] == ["NO_COARSE_FIX", "NO_COARSE_FIX", *["VALID"] * 3]
+    np.testing.assert_array_equal(np.isnan(products["track"][:, 0]), [True, True, False, False, False])
+    np.testing.assert_allclose(np.hypot(*products["track"][-1, 1:3]), row["position_error_m"])
+    assert products["inliers"].shape == (5,)
+    assert np.nanmedian(products["inliers"]) == row["inliers_median"]
+    assert (products["true_xy_m"].shape, products["estimated_xy_m"].shape) == ((4, 2), (5, 2))
+    # image 4 is the last one with an estimate before the final one; both refer to the map
+    error = products["estimated_xy_m"][3] - products["true_xy_m"][3]
+    np.testing.assert_allclose(error, products["track"][3, 1:3], atol=0.5)
+    west, east, south, north = products["map_extent_m"]
+    assert (east - west, north - south) == (pytest.approx(448 * 6.0), pytest.approx(448 * 6.0))
+    assert 0.5 * (west + east) == pytest.approx(2048.0)
+    assert products["landmarks_px"].shape == products["landmarks_residual_px"].shape
+    assert np.count_nonzero(products["landmarks_used"]) == products["inliers"][3]
