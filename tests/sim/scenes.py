@@ -43,9 +43,13 @@ def rocks_near(field: RockField, x_m: float, y_m: float, radius_m: float, above_
     return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
 
 
-def level_plate(name: int) -> Objects:
-    """Return a square of 2 m around (8 m, 8 m), 0.5 m above the ground, as a body with this name and the albedo 0.2."""
-    corners = np.array([[7.0, 7.0, 0.5], [9.0, 7.0, 0.5], [9.0, 9.0, 0.5], [7.0, 9.0, 0.5]])
+def level_plate(name: int, middle_m: float = 8.0) -> Objects:
+    """Return a square of 2 m, 0.5 m above the ground, as a body with this name and the albedo 0.2.
+
+    middle_m: x and y of its middle
+    """
+    low, high = middle_m - 1.0, middle_m + 1.0
+    corners = np.array([[low, low, 0.5], [high, low, 0.5], [high, high, 0.5], [low, high, 0.5]])
     faces, names = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), np.full(2, name, dtype=np.int32)
     return Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (4, 1)), faces, names, 0.2)
 

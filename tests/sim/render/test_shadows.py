@@ -17,7 +17,7 @@ from marsyard.sim.render.device import Array3f64, Bool, UInt32
 from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
-from tests.sim.scenes import DOWN, LAMBERT, descent_camera, make_ground, rocks_near
+from tests.sim.scenes import DOWN, LAMBERT, NEAR_MESH, descent_camera, level_plate, look_down, make_ground, rocks_near
 
 ALBEDO = 0.2
 #: Required fraction of equal pixels, from docs/validation.md.
@@ -263,3 +263,21 @@ def test_bounds_contain_all_ground_in_a_cone() -> None:
     assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, apex])[:, :2], axis=0))
     # A cone that contains the horizon has no bounds.
     assert ground_in_cones([(apex, direction(2.0, -0.1), half_angle_rad)], lowest_m) is None
+
+
+def test_changed_scene_keeps_no_outdated_shadow(renderer: Renderer) -> None:
+    """After each change of a scene the image is that of a new scene, also if all results of the old one exist."""
+    hills = make_ground(0.4 * np.sin(np.linspace(0.0, 8.0 * np.pi, 64, endpoint=False)) * np.ones((64, 1)), 0.5)
+    scene = Scene(hills, (8.0, 8.0), Sun(direction(0.5, 0.3)), LAMBERT, level_plate(1), **NEAR_MESH)
+    moved = level_plate(2, 13.0)
+    changes = (
+        lambda: scene.with_objects(moved),
+        lambda: scene.with_light(Sun(direction(2.5, 0.4)), LAMBERT),
+        lambda: scene.with_viewpoint(moved, (14.0, 12.0), 0.2, 60.0, 257),
+        lambda: scene.with_mesh((12.0, 12.0), 0.3, 60.0, 257),
+    )
+    look_down(renderer, scene, (10.0, 10.0, 12.0), 1.2, 96)
+    for change in changes:
+        changed = change()
+        images = [look_down(renderer, item, (10.0, 10.0, 12.0), 1.2, 96) for item in (changed, replace(changed))]
+        np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
