@@ -145,6 +145,9 @@ def test_profiled_stages_name_existing_functions() -> None:
     for file, function in {pair for stages in (STAGES, DESCENT_STAGES) for pairs in stages.values() for pair in pairs}:
         # folders sim, scenarios, algorithms and campaigns
         paths = [path for path in root.glob("[sac]*/**/*.py") if path.as_posix().endswith(f"/{file}")]
+        if file == "render/arrays.py":
+            # a profiler sees compiled functions in the file of their decorator
+            paths = list(root.glob("sim/render/*.py"))
         texts = [path.read_text() for path in paths]
         assert any(f"def {function}(" in text for text in texts), (file, function)
 
