@@ -112,7 +112,7 @@ DESCENTS = {
     "loc-jezero": Air(("localisation",), (0.3, 0.6, 0.9), (20.0, 30.0, 45.0)),
 }
 #: Altitudes of the camera, metres, above the ground of each descent.
-ALTITUDES_M = {"dimes-gusev": (1400.0, 2000.0), "loc-jezero": (500.0, 2000.0, 4000.0)}
+ALTITUDES_M = {"dimes-gusev": (1300.0, 2100.0), "loc-jezero": (500.0, 2000.0, 4200.0)}
 
 
 def compare_light(quick: bool) -> Iterator[Measure]:
