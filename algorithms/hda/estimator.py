@@ -172,8 +172,11 @@ def map_ground(
 
 def site_world(scene: LandingScene, ground: MappedGround) -> Vector3 | None:
     """Site in the world frame, metres, on the smooth surface; None if no cell is safe."""
-    if ground.site_cell is None:
+    cell = ground.site_cell
+    if cell is None:
         return None
-    x, y = ground.elevation.positions(np.array(ground.site_cell, dtype=np.float64))
-    site = np.array([x, y, ground.hazards.smooth_m[ground.site_cell]])
+    x, y = ground.elevation.positions(np.array(cell, dtype=np.float64))
+    # a footprint can be safe (`check_footprints`) where the squares of the smooth surface are not covered by the map
+    smooth = ground.hazards.smooth_m[cell]
+    site = np.array([x, y, smooth if np.isfinite(smooth) else ground.elevation.elevation_m[cell]])
     return np.asarray(scene.views[0].world_from_camera.translation + ground.world_from_surface.apply(site))

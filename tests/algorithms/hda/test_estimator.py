@@ -19,7 +19,9 @@ from marsyard.algorithms.hda import (
     hda_products,
 )
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
+from marsyard.algorithms.hda.estimator import site_world
 from marsyard.algorithms.hda.options import IMPROVEMENTS
+from marsyard.algorithms.hda.scene import build_scene
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement
@@ -131,6 +133,17 @@ def test_motion_and_map_match_exact_scene(scene: Pass, estimate: SiteEstimate) -
     errors = compute_map_errors(scene, estimate)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert abs(np.median(errors)) < 0.02
+
+
+def test_safe_site_without_smooth_surface_is_on_the_map(
+    measurements: LandingMeasurements, estimate: SiteEstimate
+) -> None:
+    ground = get_ground(estimate)
+    smooth_m = ground.hazards.smooth_m.copy()
+    smooth_m[ground.site_cell] = np.nan
+    uncovered = replace(ground, hazards=replace(ground.hazards, smooth_m=smooth_m))
+    site = site_world(build_scene(measurements), uncovered)
+    np.testing.assert_allclose(site, get_site(estimate), atol=0.05)
 
 
 def test_each_boulder_is_a_hazard(scene: Pass, estimate: SiteEstimate) -> None:
