@@ -147,10 +147,10 @@ def open_result(directory: str | Path) -> Result:
 
 def _name_algorithms(algorithms: Sequence[Any], folder: Path) -> list[str]:
     """Return the specifications of algorithms; objects are stored in `folder`. Raises CampaignError."""
-    from marsyard.scenarios.stored_objects import name_object
+    from marsyard.scenarios.stored_objects import store_object
 
     try:
-        return [name_object(algorithm, folder) for algorithm in algorithms]
+        return [store_object(algorithm, folder) for algorithm in algorithms]
     except ValueError as error:
         raise CampaignError(str(error)) from error
 

@@ -40,8 +40,13 @@ class AlgorithmSelection(Parameters):
 
     @property
     def options(self) -> Any:
-        """Options of the published algorithm, for all algorithms of Marsyard."""
-        return next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
+        """Options that `make` gives to each algorithm of `task.shipped`; custom algorithms do not receive them.
+
+        They are the field of the type `task.options`. Its name is chosen by the subclass (`dimes`, `hda`), since it is
+        the name of the table in the campaign file. A subclass without such a field has the default options.
+        """
+        fields = (value for _, value in self)
+        return next((value for value in fields if isinstance(value, self.task.options)), self.task.options())
 
     def make(self, algorithm: str, case: int) -> Any:
         """Create an algorithm for a case. Raises ValueError, and the exceptions of a user's constructor."""

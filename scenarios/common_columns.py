@@ -1,4 +1,7 @@
-"""Declarations of columns that several scenarios compute: world, faults, images, algorithms and velocities."""
+"""Declarations of columns that several scenarios compute.
+
+They describe the world, faults, images, algorithms, the motion of the vehicle, velocities, and hazard detection.
+"""
 
 from marsyard.scenarios.columns import Column, ColumnKind, condition, error, flag, instrument_error, outcome, text
 
@@ -45,13 +48,16 @@ ALGORITHM = (
     outcome("estimation_time_s", "processor time of the algorithm; wall-clock time of an external program"),
 )
 
+OFF_NADIR_MAX = condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle")
+ATTITUDE_RATE_MAX = condition("attitude_rate_max_deg_s", "maximum attitude rate at the images", "maximum attitude rate")
+
 MOTION = (
     condition("horizontal_speed_m_s", "true horizontal speed at the last image"),
     condition("altitude_*_m", "true height above the ground at an image", "altitude at image *"),
     condition("off_nadir_*_deg", "angle between the camera's axis and nadir at an image", "off-nadir angle at image *"),
     condition("attitude_rate_*_deg_s", "magnitude of the angular velocity at an image", "attitude rate at image *"),
-    condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle"),
-    condition("attitude_rate_max_deg_s", "maximum attitude rate at the images", "maximum attitude rate"),
+    OFF_NADIR_MAX,
+    ATTITUDE_RATE_MAX,
 )
 
 MOTION_ERRORS = (
@@ -71,7 +77,8 @@ VELOCITY = (
     error("velocity_nees", "squared error of the velocity, normalised by the reported covariance; its mean is 2"),
 )
 
-MATCHING = (
+#: Stages of hazard detection: matching of both images, estimated motion, elevation map, and landing site.
+HAZARD_DETECTION = (
     outcome("inliers", "tracks that agree with the estimated motion"),
     outcome("parallax_px", "median displacement of tracks by the translation"),
     error("rotation_error_deg", "error of the estimated rotation between both images"),

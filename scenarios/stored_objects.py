@@ -5,12 +5,14 @@ import path and state; a class or function of a notebook is stored with its code
 """
 
 import copy
+import dis
 import hashlib
 import inspect
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 #: Ending of a stored object.
@@ -40,8 +42,8 @@ class FunctionEstimator:
         self.__name__ = function.__name__
 
 
-def name_object(value: Any, folder: Path) -> str:
-    """Return the specification of an algorithm that is given as an object; store it in `folder` if necessary.
+def store_object(value: Any, folder: Path) -> str:
+    """Store an algorithm that is given as an object in `folder`, if necessary, and return its specification.
 
     - a text is returned unchanged
     - a class, or a function without parameters, is called for each case
@@ -67,9 +69,12 @@ def name_object(value: Any, folder: Path) -> str:
     try:
         contents = cloudpickle.dumps(stored)
         state = cloudpickle.dumps(vars(value)) if not isinstance(value, type) and hasattr(value, "__dict__") else b""
+        captured = _captured_values(value)
+        state += cloudpickle.dumps(captured) if captured else b""
     except Exception as error:  # objects of users may raise anything
         raise ValueError(f"the algorithm {name} cannot be stored: {type(error).__name__}: {error}") from error
-    # the bytes of a class of a notebook differ between sessions, its source and the state of an instance do not
+    # the bytes of a class of a notebook differ between sessions; its source, the state of an instance and the captured
+    # values do not
     digest = hashlib.sha256(source.encode() + state if source else contents).hexdigest()[:_HASH_DIGITS]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder.resolve() / f"{name}-{digest}{SUFFIX}"
@@ -98,6 +103,39 @@ def _read_source(value: Any) -> str:
     with suppress(OSError, TypeError):
         return inspect.getsource(target)
     return ""
+
+
+def _captured_values(value: Any, known: frozenset[int] = frozenset()) -> list[Any]:
+    """List the values that the code of an object takes from outside: defaults, closures and global variables.
+
+    The code is that of a function, or of the methods of a class or of the class of an object. Two functions or classes
+    with the same source are different algorithms if these values differ. A class or function among them is represented
+    by its name and source, and by its own captured values. Code that worker processes import is stored without values.
+    """
+    code = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
+    if id(code) in known or _is_importable(code):
+        return []
+    functions = (
+        [code] if inspect.isfunction(code) else [item for item in vars(code).values() if inspect.isfunction(item)]
+    )
+    captured: list[Any] = []
+    for item in (item for function in functions for item in _outside_values(function)):
+        if isinstance(item, type) or inspect.isfunction(item):
+            source = "" if _is_importable(item) else _read_source(item)
+            captured += [(item.__module__, item.__qualname__, source), *_captured_values(item, known | {id(code)})]
+        elif not inspect.ismodule(item):
+            captured.append(item)
+    return captured
+
+
+def _outside_values(function: FunctionType) -> list[Any]:
+    """List the defaults, the closure and the global variables of a function; names that have no value are omitted."""
+    values = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+    for cell in function.__closure__ or ():
+        with suppress(ValueError):  # the variable has no value yet
+            values.append(cell.cell_contents)
+    names = sorted({item.argval for item in dis.get_instructions(function) if item.opname == "LOAD_GLOBAL"})
+    return values + [function.__globals__[name] for name in names if name in function.__globals__]
 
 
 def _has_required_parameters(function: Callable[..., Any]) -> bool:

@@ -1,7 +1,8 @@
 """Measurements in JSON: the keys of a table are the field names of a data class, with the suffix `_xyzw` for rotations.
 
 Arrays are lists. A rotation is a unit quaternion, scalar last; a pose is a position `position_world_m` and a rotation.
-A number that is not finite (no reading) is null, and a missing value has no key.
+A single number that is not finite (no reading) is null, and a missing value has no key. Arrays contain finite numbers
+only: `files.write_json` and the lines to a program reject others.
 """
 
 import math

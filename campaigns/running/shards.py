@@ -104,6 +104,7 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
             _copy_products(directory, folder)
         sessions = [session for stored in records for session in stored["sessions"]]
         started = min(stored["started_utc"] for stored in records)
+        # like an interrupted run, the campaign lacks its table and report, which `continue_campaign` writes
         updates = {"sessions": sessions, "started_utc": started, "state": "interrupted", "merged": len(directories)}
         record.write(folder, {**{key: value for key, value in first.items() if key != SHARD_KEY}, **updates})
 

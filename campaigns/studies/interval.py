@@ -19,8 +19,8 @@ class ProbabilityInterval:
 
     - estimate, lower, upper: probability, and bounds of the interval
     - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
-    - log_sd: standard deviation of the logarithm of an estimate: that of one replicate, or that of all cases of
-      importance sampling together
+    - log_sd: stored for the reader only, since its meaning depends on the function: the standard deviation of the
+      logarithm of one replicate (`replicate_interval`), or of the mean of all cases (`weighted_interval`)
     """
 
     estimate: Number
@@ -59,18 +59,19 @@ def _log_half_width(variance: float, replicates: int, confidence: float) -> floa
     return quantile * math.sqrt(variance / replicates + variance**2 / (2.0 * (replicates - 1)))
 
 
-def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:
+def additional_replicates(estimates: Sequence[float], confidence: float, max_probability: float) -> int | None:
     """Estimate the number of additional replicates whose interval (`replicate_interval`) excludes the limit.
 
-    - interval: interval of the present replicates; their spread is assumed to remain the same
-    - replicates: number of the present replicates
+    - estimates: estimates of the present replicates, at least two; their spread is assumed to remain the same
+    - confidence: two-sided confidence of the next interval
 
     None if the estimate is so close to the limit that fewer than `_MAX_REPLICATES` do not decide.
     """
-    distance = abs(math.log(max_probability / interval.estimate)) if interval.estimate > 0.0 else math.inf
-    for count in range(replicates + 1, _MAX_REPLICATES if distance > 0.0 else 0):
-        if _log_half_width(interval.log_sd**2, count, interval.confidence) <= distance:
-            return count - replicates
+    present = replicate_interval(estimates, confidence)
+    distance = abs(math.log(max_probability / present.estimate))
+    for count in range(len(estimates) + 1, _MAX_REPLICATES if distance > 0.0 else 0):
+        if _log_half_width(present.log_sd**2, count, confidence) <= distance:
+            return count - len(estimates)
     return None
 
 

@@ -113,6 +113,11 @@ class RareSample:
     violation_weights: Sequence[float] | None = None
     shortfall: str = ""
 
+    @property
+    def estimates(self) -> list[float]:
+        """Estimates of the probability by the replicates."""
+        return [item.probability for item in self.replicates]
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -163,9 +168,10 @@ def decide_rare(sample: RareSample, max_probability: float, confidence: float, e
     undecided = Decision(RareVerdict.INSUFFICIENT, Basis.NONE, *evidence, reason)
     next_risk = _evaluation_risk(confidence, evaluations + 1)
     if not reason and interval.estimate > max_probability:
-        next_interval = replace(interval, confidence=1.0 - next_risk)
-        further = additional_replicates(next_interval, len(sample.replicates), max_probability)
-        return replace(undecided, additional_replicates=None if sample.violation_weights else further)
+        if sample.violation_weights is not None:
+            return undecided
+        further = additional_replicates(sample.estimates, 1.0 - next_risk, max_probability)
+        return replace(undecided, additional_replicates=further)
     needed = find_units_needed(counting.violating_units, max_probability, next_risk)
     return replace(undecided, additional_random_cases=needed - counting.units)
 
@@ -187,7 +193,7 @@ def _estimate(sample: RareSample, confidence: float) -> tuple[ProbabilityInterva
         problems.append(sample.shortfall)
     if problems or len(sample.replicates) < _MIN_REPLICATES:
         return unknown_interval(confidence), None, " ".join(problems)
-    interval = replicate_interval([item.probability for item in sample.replicates], confidence)
+    interval = replicate_interval(sample.estimates, confidence)
     if sample.violation_weights is None:
         return interval, None, ""
     effective = effective_number(sample.violation_weights)

@@ -70,7 +70,9 @@ def start_robust(
         raise CampaignError(f"{run}: there is nothing to change: all variants have the values of the campaign")
     for variant in (*steps, *named):
         _check_values(campaign, variant)
-    rows = read_rows(run / TABLE_FILE)[int(definition.design.nominal) :]
+    rows = read_rows(run / TABLE_FILE)
+    if definition.design.nominal:
+        rows = rows[1:]  # the first case is no random draw
     chosen, weights = choose_cases(rows, definition.requirements, cases, _generator(definition))
     parameters = RobustParameters((*steps, *named), tuple(chosen.tolist()), tuple(weights.tolist()))
     session = StudySession(ROBUST, parameters, RobustCasesStudy, executor, observer)
@@ -153,7 +155,7 @@ def _generator(definition: CampaignDefinition) -> np.random.Generator:
 
 
 class RobustCasesStudy:
-    """A running study."""
+    """Running study `robust`: the chosen cases, each in all variants, run in batches."""
 
     def __init__(self, campaign: Campaign, parameters: RobustParameters, runner: PointRunner) -> None:
         self._campaign, self._parameters, self._runner = campaign, parameters, runner
@@ -168,7 +170,9 @@ class RobustCasesStudy:
         return RobustResult(self._runner.n_cases)
 
     def _point(self, case: int, values: Mapping[str, Any]) -> StudyPoint:
+        """Create the point of a stored case with the values of a variant."""
         uniform = self._campaign.draw_uniform(case)
         coordinates = tuple(ndtri([uniform[path] for path in self._campaign.drawn_paths]).tolist())
+        # a dispersed parameter would have its sampled value; as a nominal one it has the value of the variant
         fixed = tuple(path for path in values if path in self._campaign.definition.dispersions)
         return StudyPoint(coordinates, case, nominal=fixed, values=tuple(values.items()))

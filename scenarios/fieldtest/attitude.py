@@ -1,4 +1,8 @@
-"""Gyros of the field test: they measure the Earth's rotation, and drift with their temperature."""
+"""Attitude of the field test: measurements of the gyros, and the estimate from gyros and sightings of targets.
+
+The gyros measure the Earth's rotation, and drift with their temperature. `solve_attitude` estimates the attitude at the
+start of the flight and the constant gyro bias by Gauss-Newton iterations, and propagates the attitude from there.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,8 @@ from marsyard.sim.sensor.inertial import InertialSolution
 EARTH_RATE_RAD_S = 7.292115e-5
 #: Gauss-Newton iterations of attitude and bias.
 _ITERATIONS = 3
+#: Blocks of the estimated change: rotation vector of the attitude at the start, inertial axes, and gyro bias.
+_TURN, _BIAS = slice(0, 3), slice(3, 6)
 
 
 @dataclass(frozen=True)
@@ -70,10 +76,11 @@ def add_thermal_drift(
     The temperature of the unit follows the air temperature with a first-order lag. The air is cooler from the end of
     the first pass over the targets to the end of the last pass along the line.
     """
+    (_, first_fly_over_end_s), _ = flight.fly_overs_s
     times = start_s + increments.period_s * (np.arange(len(increments.delta_angles_rad)) + 0.5)
     cooling, warming = (
         -np.expm1(-np.maximum(times - change_s, 0.0) / p.time_constant_s)
-        for change_s in (flight.fly_overs_s[0][1], flight.passes[-1].end_s)
+        for change_s in (first_fly_over_end_s, flight.passes[-1].end_s)
     )
     # the drift is that of the gyro along the body's x axis
     rates = DEG_H * p.across_deg_h_k * (p.change_k * (cooling - warming))
@@ -119,8 +126,8 @@ def solve_attitude(
         prior = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1) / bias_sd_rad_s
         residuals = np.concatenate([(inertial_directions - predicted).ravel() / sighting_sd_rad, -bias / bias_sd_rad_s])
         change = np.linalg.lstsq(np.concatenate([rows, prior]), residuals, rcond=None)[0]
-        start = Rotation.from_rotvec(change[:3]) * start
-        bias = bias + change[3:]
+        start = Rotation.from_rotvec(change[_TURN]) * start
+        bias = bias + change[_BIAS]
     propagated = _propagate(increments, bias)
     to_world = earth.to_inertial(increments.times_s).inv()
     return replace(propagated, attitudes=to_world * start * propagated.attitudes)

@@ -9,7 +9,7 @@ COLUMNS = Columns(
         *common.SUN,
         *common.FAULTS,
         *common.CONTRAST,
-        *common.MATCHING,
+        *common.HAZARD_DETECTION,
         *common.ALGORITHM,
         *common.IMAGES,
         condition("height_m", "true height above the ground at the first image"),

@@ -54,7 +54,8 @@ class LanderCameraParameters(Parameters):
     def _check_field(self) -> LanderCameraParameters:
         camera = true_camera(self)
         edge = np.array([[-0.5, 0.5 * (self.pixels - 1)]])
-        angle = np.arccos(-camera.rays(edge)[1][0, 2])
+        _, ((_, _, z),) = camera.rays(edge)
+        angle = np.arccos(-z)  # from the optical axis, -z
         # a distortion that is not monotonic has the angle of another point at the edge
         if not np.all(np.isfinite(camera.corner_rays()[1])) or not abs(angle - 0.5 * np.radians(self.field_deg)) < 1e-4:
             raise ValueError(
@@ -109,13 +110,13 @@ def _full_well_e() -> float:
 
 def _create_detector() -> DetectorParameters:
     full_well = _full_well_e()
-    # f-number, pixel pitch (um), passband (nm)
-    light = LightPath(2.7, LanderCameraParameters().pixel_pitch_um, (400.0, 900.0))
+    pitch_um = LanderCameraParameters().pixel_pitch_um
+    light = LightPath(f_number=2.7, pixel_pitch_um=pitch_um, band_nm=(400.0, 900.0))
     return DetectorParameters(
         exposure_s=_EXPOSURE_S,
         responsivity_e_s=BRIGHT_FILL * full_well / (BRIGHT_RADIANCE_FACTOR * _EXPOSURE_S),
         sun_au=LANDING_AU,
-        rows_summed=1,
+        rows_summed=1,  # of the delivered pixels, which all parameters describe
         transfer_row_s=0.0,
         clear_row_s=0.0,
         readout_row_s=1e-4,
@@ -130,8 +131,9 @@ def _create_detector() -> DetectorParameters:
     )
 
 
-#: Detector of the lander's camera: global shutter, 8 bits, 150 us, SNR 80 at half full well, f/2.7. Pixels are sums of
-#: 2 x 2. Assumed: read noise, offset, dark current (0.3 electrons in an exposure), readout, passband, blur; and the
-#: responsivity, which fills 60 % of the full well at the radiance factor 0.3 (the other presets' exposure). It is 35 %
-#: of that of an f/2.7 lens on a CCD of the same pitch: the rest is lost in the fill factor of a global shutter.
+#: Detector of the lander's camera: global shutter, 8 bits, 150 us, SNR 80 at half full well, f/2.7. Its pixels are the
+#: delivered ones, each the sum of 2 x 2 pixels of the chip; the summation itself is not simulated. Assumed: read noise,
+#: offset, dark current (0.3 electrons in an exposure), readout, passband, blur; and the responsivity, which fills 60 %
+#: of the full well at the radiance factor 0.3 (the other presets' exposure). It is 35 % of that of an f/2.7 lens on a
+#: CCD of the same pitch: the rest is lost in the fill factor of a global shutter.
 LANDER_DETECTOR = _create_detector()

@@ -53,8 +53,8 @@ def _join(estimates: Sequence[PositionEstimate]) -> StreamAnswers[PositionEstima
     return StreamAnswers(tuple(estimates[:-1]), estimates[-1], (math.nan,) * (len(estimates) - 1))
 
 
-def _refuse(measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
-    """Return refusals, the answers of a run that only exports the measurements: it produces no estimates."""
+def _create_refusals(measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
+    """Create the refusals that a run returns if it only exports the measurements: it produces no estimates."""
     refusal = PositionEstimate(PositionOutcome.NO_COARSE_FIX, float(measurements.increments.times_s[-1]))
     return StreamAnswers((refusal,) * len(measurements.images), refusal)
 
@@ -70,7 +70,7 @@ POSITION_FORMAT = AnswerFormat(
         "covariance": tuple(f"covariance_{row}_{column}" for row, column in zip(*np.triu_indices(9), strict=True)),
     },
     required=("time_s",),
-    create_empty=_refuse,
+    create_empty=_create_refusals,
     note=(
         "A descent has one line for each image, in the order of the images, and a last line for the end of the\n"
         "inertial data. All lines have `time_s`; lines with the outcome VALID have all other numbers, lines with\n"
@@ -86,7 +86,7 @@ POSITION_FORMAT = AnswerFormat(
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
     noun="position estimator",
-    methods=(),
+    methods=(),  # none receives all measurements at once: all are streams
     answers=(PositionEstimate, PositionOutcome),
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},
     executable=partial(ExecutableAlgorithm, requests=POSITION_STREAM.requests),

@@ -71,7 +71,7 @@ VELOCITY_COLUMNS = Columns(
         *common.ALGORITHM,
         *common.VELOCITY,
         condition("altitude_*_m", "measured altitude at an image", "altitude at image *"),
-        condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle"),
+        common.OFF_NADIR_MAX,
         condition("sun_elevation_deg", "elevation of the sun above the horizon"),
         flag("truth_known", "the truth is known"),
         error("inertial_difference_m_s", "difference from the inertial velocity, which has an unknown constant error"),
@@ -86,7 +86,7 @@ LANDING_COLUMNS = Columns(
     (
         *_CASE,
         *common.ALGORITHM,
-        *common.MATCHING,
+        *common.HAZARD_DETECTION,
         condition("slant_range_m", "measured distance to the ground along the optical axis"),
         flag("truth_known", "the truth is known"),
         outcome("site_up_m", "height of the site"),

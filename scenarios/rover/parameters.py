@@ -250,7 +250,10 @@ class CustomPair(Parameters):
 
 
 class MastCameraParameters(Parameters):
-    """The stereo pair on the mast."""
+    """The stereo pair on the mast.
+
+    `defocus_px`, `stray_light`, `dust_discs` and `dust_depth` replace the optics of the detector, if they are given.
+    """
 
     preset: str = Field(
         default="mer-navcam",
@@ -262,15 +265,23 @@ class MastCameraParameters(Parameters):
         True
     )
     defocus_px: Annotated[
-        NonNegative, OPTICS, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
-    ] = 0.0
+        float | None,
+        OPTICS,
+        bounded_field(0.0, 10.0, "defocus: diameter of the blur circle of a point; default: the detector's"),
+    ] = None
     stray_light: Annotated[
-        float, OPTICS, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
-    ] = 0.0
+        float | None,
+        OPTICS,
+        bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly; default: the detector's"),
+    ] = None
     dust_discs: Annotated[
-        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on each camera window")
-    ] = 0
-    dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
+        int | None,
+        OPTICS,
+        Field(ge=0, le=1000, description="number of specks of dust on each camera window; default: the detector's"),
+    ] = None
+    dust_depth: Annotated[
+        Fraction | None, Field(description="fraction of the light absorbed by a speck; default: the detector's")
+    ] = None
 
     @field_validator("preset")
     @classmethod
@@ -303,7 +314,7 @@ class MastCameraParameters(Parameters):
         """Return the parameters of both detectors."""
         detector = preset(self.preset).detector if self.detector is None else self.detector
         errors = {name: getattr(self, name) for name in ("defocus_px", "stray_light", "dust_discs", "dust_depth")}
-        changes = {name: value for name, value in errors.items() if value}
+        changes = {name: value for name, value in errors.items() if value is not None}
         return detector.model_copy(update={"optics": detector.optics.model_copy(update=changes)})
 
 

@@ -1,6 +1,7 @@
 """Tests of the Python interface: algorithms given as objects, campaigns without files, and results."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.result import Result, open_result
 from marsyard.scenarios.imports import import_object, source_files
-from marsyard.scenarios.stored_objects import name_object
+from marsyard.scenarios.stored_objects import store_object
 from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
 
 SCENARIO = "tests.campaigns.fake_velocity:FakeVelocityScenario"
@@ -62,7 +63,7 @@ def test_object_has_the_rows_of_its_import_path(estimator_module: Any, tmp_path:
     ]
     expected, rows = (list[Any](result.evaluation.run.all_cases.to_dict("records")) for result in results)
     assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 3
-    assert name_object(estimator_module.MyEstimator, tmp_path) == "my_notebook_module:MyEstimator"
+    assert store_object(estimator_module.MyEstimator, tmp_path) == "my_notebook_module:MyEstimator"
     tested = results[1].evaluation.run.record["algorithms"][0]
     assert (tested["version"], tested["role"]) == ("2.0", "tested")
     assert tested["source_hash"]
@@ -71,16 +72,16 @@ def test_object_has_the_rows_of_its_import_path(estimator_module: Any, tmp_path:
 def test_classes_and_functions_of_a_notebook_are_stored_with_their_code(tmp_path: Path) -> None:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     exec(MODULE, namespace)  # noqa: S102  (as a notebook does)
-    by_class = name_object(namespace["MyEstimator"], tmp_path)
+    by_class = store_object(namespace["MyEstimator"], tmp_path)
     assert by_class.startswith(str(tmp_path))
     estimate = import_object(by_class)().estimate(None)
     assert estimate.outcome is namespace["VelocityOutcome"].NO_VALID_TRACK
-    by_function = name_object(refuse, tmp_path)
+    by_function = store_object(refuse, tmp_path)
     assert import_object(by_function)().estimate(None).outcome is VelocityOutcome.IMU_MISMATCH
 
 
 def test_instances_are_copied_and_their_state_identifies_them(estimator_module: Any, tmp_path: Path) -> None:
-    first, equal, other = (name_object(estimator_module.MyEstimator(gain), tmp_path) for gain in (1.0, 1.0, 2.0))
+    first, equal, other = (store_object(estimator_module.MyEstimator(gain), tmp_path) for gain in (1.0, 1.0, 2.0))
     assert first == equal != other
     factory = import_object(other)
     algorithm = factory()
@@ -89,6 +90,47 @@ def test_instances_are_copied_and_their_state_identifies_them(estimator_module: 
     ((name, path),) = source_files(other)
     assert name.endswith(".py")
     assert "class MyEstimator" in path.read_text()
+
+
+def _refuse_with(outcome: VelocityOutcome, span_s: float = 0.0) -> Callable[[Any], VelocityEstimate]:
+    def answer(_measurements: Any, span_s: float = span_s) -> VelocityEstimate:
+        return VelocityEstimate(outcome, None)
+
+    return answer
+
+
+def _wrap(function: Callable[[Any], VelocityEstimate]) -> Callable[[Any], VelocityEstimate]:
+    return lambda measurements: function(measurements)
+
+
+def _create_class(outcome: VelocityOutcome) -> type:
+    class Refusing:
+        def estimate(self, _measurements: Any) -> VelocityEstimate:
+            return VelocityEstimate(outcome, None)
+
+    return Refusing
+
+
+def test_captured_values_identify_functions_and_classes(tmp_path: Path) -> None:
+    outcomes = VelocityOutcome.IMU_MISMATCH, VelocityOutcome.NO_VALID_TRACK
+    functions = [_refuse_with(outcome) for outcome in outcomes]
+    wrapped, classes = [_wrap(function) for function in functions], [_create_class(outcome) for outcome in outcomes]
+    for kinds in (functions, wrapped, classes, [item() for item in classes]):
+        specs = [store_object(item, tmp_path) for item in kinds]
+        answers = [import_object(spec)().estimate(None) for spec in specs]
+        assert tuple(answer.outcome for answer in answers) == outcomes
+    first, equal, other = (store_object(_refuse_with(outcomes[0], span_s), tmp_path) for span_s in (1.0, 1.0, 2.0))
+    assert first == equal != other
+
+
+def test_global_variables_identify_a_function_of_a_notebook(tmp_path: Path) -> None:
+    source, cell, specs = "def estimate(measurements):\n    return gain\n", tmp_path / "cell.py", []
+    cell.write_text(source)
+    for gain in (1.0, 1.0, 2.0):
+        namespace: dict[str, Any] = {"__name__": "__main__", "gain": gain}
+        exec(compile(source, cell, "exec"), namespace)  # noqa: S102  (as a notebook does)
+        specs.append(store_object(namespace["estimate"], tmp_path))
+    assert specs[0] == specs[1] != specs[2]
 
 
 def test_objects_that_cannot_be_stored_are_reported(tmp_path: Path) -> None:

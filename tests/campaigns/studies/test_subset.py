@@ -126,8 +126,8 @@ def test_separate_failure_regions_have_separate_densities() -> None:
 
 
 def test_more_replicates_are_needed_near_the_limit() -> None:
-    interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], 0.9)
-    near, far = (additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4))
+    estimates = [0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4]
+    near, far = (additional_replicates(estimates, 0.9, max_probability) for max_probability in (1e-4, 2e-4))
     assert near is not None
     assert far is not None
     assert near > far >= 1

@@ -21,7 +21,7 @@ from marsyard.scenarios.conformance.trackers import drive_to_target
 from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.stored_objects import name_object
+from marsyard.scenarios.stored_objects import store_object
 from marsyard.scenarios.velocity import VELOCITY, run_estimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
@@ -153,7 +153,7 @@ def test_tracker_in_its_own_process_gives_the_same_answers() -> None:
 
 
 def test_stored_object_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = name_object(lambda measurements: VelocityEstimate(VelocityOutcome.VALID, np.ones(2)), tmp_path / "objects")
+    spec = store_object(lambda measurements: VelocityEstimate(VelocityOutcome.VALID, np.ones(2)), tmp_path / "objects")
     monkeypatch.chdir(tmp_path)
     relative = f"objects/{Path(spec.rpartition(':')[0]).name}:{spec.rpartition(':')[2]}"
     for name in (spec, relative):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.rover.closed_loop import run_case
-from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import MastCameraParameters, MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.sim.dynamics.rover import ROCKY_8, settle
@@ -46,6 +46,14 @@ def test_images_use_the_sun_direction_of_their_time() -> None:
     assert 10.0 < sun_rotation_deg < 16.0 / 66.0 * minutes + 0.01
     fixed_directions = [fixed_sun_run.setup.world.scene(stop.time_s).sun.direction for stop in fixed_sun_run.stops[:2]]
     np.testing.assert_allclose(fixed_directions[0], fixed_directions[1], atol=1e-12)
+
+
+def test_camera_replaces_the_optics_of_its_detector_only_if_given() -> None:
+    optics = {"defocus_px": 1.0, "stray_light": 0.1, "dust_discs": 5, "dust_depth": 0.2}
+    own = {"detector": {"preset": "mer-navcam", "optics": optics}}
+    for changes in ({}, dict.fromkeys(optics, 0), {"stray_light": 0.3}):
+        parameters = MastCameraParameters.model_validate({**own, **changes}).detector_parameters()
+        assert {name: getattr(parameters.optics, name) for name in optics} == {**optics, **changes}
 
 
 def test_bright_sky_underexposes_full_frames() -> None:
