@@ -43,6 +43,20 @@ def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:
     return (*hash_words(campaign), case, *hash_words(name))
 
 
+def substream(rng: np.random.Generator, name: str) -> np.random.Generator:
+    """Derive a random generator from the seed of `rng` and a name.
+
+    It does not depend on earlier draws or spawns from `rng`, and does not change `rng`. Raises TypeError if `rng` was
+    not created from a `SeedSequence`.
+    """
+    seed = rng.bit_generator.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        raise TypeError(f"the generator is seeded by {type(seed).__name__}; a SeedSequence is needed")
+    key = (*seed.spawn_key, *hash_words(name))
+    child = np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size)
+    return np.random.Generator(np.random.PCG64(child))
+
+
 #: Components of blended streams: numbers of cases and their weights, whose squares add up to 1; the newest is the last.
 Blend = tuple[tuple[int, float], ...]
 #: Maximum number of values of a draw that is blended. Larger draws, such as the noise of an image, are those of the

@@ -40,17 +40,23 @@ def level_sizes(template_half: int, window_half: int, size: tuple[int, int]) -> 
     """Compute the sizes at each pyramid level, finest level first (Eqs. 4 and 5), for images of size (columns, rows).
 
     The w of Eq. 4 is assumed to be the half width of Eq. 5. With n = log2(w) - 2 levels, rounded down, the coarsest
-    window has a half width of 4 to 8. Levels at which the template exceeds `MAX_TEMPLATE_FRACTION` of the image are
-    omitted; the window of the coarsest remaining level then has the half width w at its scale (Eq. 5).
+    window has a half width of 4 to 8. The levels end before the first coarse one at which the template exceeds
+    `MAX_TEMPLATE_FRACTION` of the image; the window of the coarsest remaining level has the half width w at its scale
+    (Eq. 5). The finest level always remains.
     """
     levels = max(int(np.log2(window_half)) - 2, 0)
-    templates = [max(MIN_HALF_PX, int(template_half / 2**level + 0.5)) for level in range(levels + 1)]
-    fits = [
-        2 * template + 1 <= MAX_TEMPLATE_FRACTION * (min(size) >> level) for level, template in enumerate(templates)
-    ]
-    coarsest = max(level for level in range(levels + 1) if level == 0 or all(fits[: level + 1]))
+    templates: list[int] = []
+    for level in range(levels + 1):
+        template = max(MIN_HALF_PX, int(template_half / 2**level + 0.5))
+        fits = 2 * template + 1 <= MAX_TEMPLATE_FRACTION * (min(size) >> level)
+        # the image itself is always searched
+        if fits or level == 0:
+            templates.append(template)
+        if not fits:
+            break
+    coarsest = len(templates) - 1
     windows = [MIN_HALF_PX] * coarsest + [max(MIN_HALF_PX, int(window_half / 2**coarsest + 0.5))]
-    return tuple(LevelSize(template, window) for template, window in zip(templates, windows, strict=False))
+    return tuple(LevelSize(template, window) for template, window in zip(templates, windows, strict=True))
 
 
 def window_half_px(view: CameraView, options: HdaOptions) -> int:
@@ -143,41 +149,42 @@ def track_features(
     """
     sizes = level_sizes(options.template_half_px, window_half, (first.shape[1], first.shape[0]))
     first_levels, second_levels = (pyramid(counts, len(sizes)) for counts in (first, second))
-    pixels = np.rint(features[:, ::-1]).astype(np.int64)
+    # the kernels need (row, column) in the first image; pixels of features and matches are (u, v)
+    pixels_rc = np.rint(features[:, ::-1]).astype(np.int64)
     max_shift = float(max(first.shape))
-    expected_shifts = np.clip(np.nan_to_num(expected_pixels - features, nan=0.0), -max_shift, max_shift)[:, ::-1]
-    shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
+    expected_rc = np.clip(np.nan_to_num(expected_pixels - features, nan=0.0), -max_shift, max_shift)[:, ::-1]
+    shifts_rc = np.rint(expected_rc / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
-        last = np.array(first_levels[level].shape) - 1 - size.template_half
-        positions = np.clip(pixels >> level, size.template_half, last)
-        shifts, _ = matching.find_best_shifts(
-            first_levels[level], second_levels[level], positions, shifts, size.template_half, size.window_half
+        last_rc = np.array(first_levels[level].shape) - 1 - size.template_half
+        positions_rc = np.clip(pixels_rc >> level, size.template_half, last_rc)
+        shifts_rc, _ = matching.find_best_shifts(
+            first_levels[level], second_levels[level], positions_rc, shifts_rc, size.template_half, size.window_half
         )
-        shifts = 2 * shifts if level else shifts
-    second_pixels, correlations = matching.refine_positions(
-        first_levels[0], second_levels[0], pixels, shifts, options.template_half_px
+        shifts_rc = 2 * shifts_rc if level else shifts_rc
+    second_uv, correlations = matching.refine_positions(
+        first_levels[0], second_levels[0], pixels_rc, shifts_rc, options.template_half_px
     )
     is_accepted = correlations >= options.min_track_correlation
     if options.align:
         for k in np.flatnonzero(is_accepted):
-            match = align_track(first_levels[0], second_levels[0], pixels[k], second_pixels[k], options)
-            is_accepted[k] = match is not None
-            second_pixels[k] = second_pixels[k] if match is None else match
-    return Tracks(features, second_pixels, correlations, is_accepted)
+            match_uv = align_track(first_levels[0], second_levels[0], pixels_rc[k], second_uv[k], options)
+            is_accepted[k] = match_uv is not None
+            second_uv[k] = second_uv[k] if match_uv is None else match_uv
+    return Tracks(features, second_uv, correlations, is_accepted)
 
 
 def align_track(
-    first: Raster, second: Raster, pixel: Int[np.ndarray, "2"], match_pixel: Vector2, options: HdaOptions
+    first: Raster, second: Raster, pixel_rc: Int[np.ndarray, "2"], match_uv: Vector2, options: HdaOptions
 ) -> Vector2 | None:
     """Align the match of a pixel (row, column) of the first image; return its pixel (u, v) in the second image.
 
-    The alignment starts at `match_pixel` (u, v), with an affine warp. None if it fails or its correlation is too low.
+    The alignment starts at `match_uv`, with an affine warp. None if it fails or its correlation is too low.
     """
     half = options.template_half_px
-    row, column = pixel
+    row, column = pixel_rc
     template = first[row - half : row + half + 1, column - half : column + half + 1]
-    match = register_template(template, second, match_pixel[::-1] - half, "stretch", limits=ALIGNMENT_LIMITS)
+    match = register_template(template, second, match_uv[::-1] - half, "stretch", limits=ALIGNMENT_LIMITS)
     if match is None or match.score < options.min_aligned_correlation:
         return None
     return np.asarray(match.corner[::-1] + half)

@@ -38,10 +38,10 @@ from marsyard.algorithms.localisation.consistency import (
 )
 from marsyard.algorithms.localisation.inertial_state import POSITION
 from marsyard.algorithms.localisation.interface import MapProduct
-from marsyard.algorithms.localisation.map_sampling import elevation_at
+from marsyard.algorithms.localisation.map_sampling import bin_map, elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.algorithms.localisation.rectification import GroundView, bin_map, rectify_to_plane, view_ground
+from marsyard.algorithms.localisation.rectification import GroundView, rectify_to_plane, view_ground
 
 
 class CoarseRefusal(Enum):

@@ -17,13 +17,14 @@ from jaxtyping import Float
 from marsyard.algorithms.localisation.coarse import CoarseFix, find_coarse_position
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.fine import match_landmarks
+from marsyard.algorithms.localisation.inertial_state import MOTION, POSITION
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.landmarks import Landmarks, select_landmarks
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.algorithms.localisation.state_updates import GroundHeight, LandmarkMeasurement, UpdateOutcome
+from marsyard.algorithms.localisation.state_updates import GroundHeight, GroundModel, LandmarkMeasurement, UpdateOutcome
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
 #: Distance over which the slope of the map's elevation is measured, map pixels.
@@ -66,7 +67,7 @@ class MapRelativeEstimator:
             return
         self._altitudes = [*self._altitudes, measurement][-self.options.coarse_altitudes :]
         if self._has_fix:
-            self._update_altitude(measurement)
+            self._update_altitude(measurement, self._ground_height)
 
     def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Match an image with the map, and return the state at its time.
@@ -100,7 +101,7 @@ class MapRelativeEstimator:
             return None
         state = self._inertial.state_at(image.time_s)
         images, heights = zip(*self._coarse_images, strict=True)
-        fix = find_coarse_position(images, heights, self._map, state.covariance[:9, :9], self.options)
+        fix = find_coarse_position(images, heights, self._map, state.covariance[MOTION, MOTION], self.options)
         if not isinstance(fix, CoarseFix):
             return None
         position_m = state.position_m[:2] + fix.offset_m
@@ -113,7 +114,8 @@ class MapRelativeEstimator:
             # at the time of the altitude, the state does not yet contain the fix
             if self._inertial.is_stored(altitude.time_s):
                 below_m = self._inertial.state_at(altitude.time_s).position_m[:2] + fix.offset_m
-                self._update_altitude(altitude, (elevation_at(self._map, below_m), np.zeros(2)))
+                level_ground = elevation_at(self._map, below_m), np.zeros(2)
+                self._update_altitude(altitude, level_ground)
         return np.asarray(position_m)
 
     def _run_fine_stage(
@@ -121,7 +123,7 @@ class MapRelativeEstimator:
     ) -> PositionEstimate:
         """Match landmarks and update the state; after several failures the coarse stage is repeated."""
         options, covariance = self.options, self._filter.state_at(image.time_s).covariance
-        position_sd_m = np.sqrt(np.diag(covariance)[:3])  # east, north, up
+        position_sd_m = np.sqrt(np.diag(covariance)[POSITION])  # east, north, up
         matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
         if len(matches) == 0:
             return self._count_failure(
@@ -133,13 +135,16 @@ class MapRelativeEstimator:
         common_sd_m = np.hypot(
             options.common_fraction * point_sd_m, height_m * options.calibration_sd_rad * np.array([1.0, 1.0, 0.0])
         )
+        # The filter treats these errors as independent between images, but they are equal in N successive images. Its
+        # mean over N images has the right variance if that of one image is multiplied by N.
+        filter_common_sd_m = np.sqrt(options.correlated_images) * common_sd_m
         measurement = LandmarkMeasurement(
             image.camera,
             matches.points_m,
             matches.measured_px,
             pixel_sd=options.landmark_sd_px * matches.working_pixel,
             point_sd_m=point_sd_m,
-            common_sd_m=np.sqrt(options.correlated_images) * common_sd_m,
+            common_sd_m=filter_common_sd_m,
             is_rigid=True,
             alignment_sd_rad=options.calibration_sd_rad,
         )
@@ -196,10 +201,10 @@ class MapRelativeEstimator:
         velocity = self._inertial.state_at(time_s).velocity_m_s
         return last.altitude_m + float(velocity[2]) * (time_s - last.time_s)
 
-    def _update_altitude(self, measurement: AltitudeMeasurement, ground: GroundHeight | None = None) -> None:
-        """Update the state by an altitude above `ground`, by default the map's elevation at the estimated position."""
+    def _update_altitude(self, measurement: AltitudeMeasurement, ground: GroundModel) -> None:
+        """Update the state by an altitude above the ground, by the errors of the altitude and the map's elevation."""
         sd_m = float(np.hypot(self.options.altitude_sd * measurement.altitude_m, self._map.elevation_sd_m))
-        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, ground or self._ground_height, sd_m)
+        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, ground, sd_m)
 
     def _ground_height(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
         """Elevation of the map and its slope (east, north) at a position."""

@@ -92,6 +92,8 @@ class ImuErrorModel:
 #: (m/s2).
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
+#: Blocks of the motion: position, velocity and attitude.
+MOTION = slice(POSITION.start, ATTITUDE.stop)
 ERRORS = 15  #: Number of errors.
 
 

@@ -1,4 +1,6 @@
-"""Sampling of the map: coordinates, interpolation, averaging, and intersection of rays with the map's elevation."""
+"""Sampling of the map: coordinates, interpolation, averages, binning, and intersection of rays with its elevation."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -30,9 +32,9 @@ def sample_raster(
 def sample_averages(
     raster: Float32[np.ndarray, "rows columns"], pixels: Float[np.ndarray, "patches n m 2"]
 ) -> Float32[np.ndarray, "patches n m"]:
-    """Average a raster over the cells of lattices of positions (column, row): four samples in each cell.
+    """Average a raster over the cells of grids of positions (column, row): four samples in each cell.
 
-    The cell of a lattice position extends halfway to its neighbours. Four bilinear samples average over cells of up to
+    The cell of a grid position extends halfway to its neighbours. Four bilinear samples average over cells of up to
     about three raster pixels without gaps.
     """
     patches, rows, columns = pixels.shape[:3]
@@ -43,6 +45,23 @@ def sample_averages(
             shifted = pixels + row_sign * along_rows + column_sign * along_columns
             total += sample_raster(raster, shifted.reshape(patches * rows, columns, 2))
     return np.asarray((0.25 * total).reshape(patches, rows, columns))
+
+
+def bin_map(map_product: MapProduct, factor: int) -> MapProduct:
+    """Average blocks of `factor` x `factor` map pixels; incomplete blocks at the upper ends are left out."""
+    rows, columns = (extent // factor for extent in map_product.appearance.shape)
+
+    def average(raster: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
+        cropped = np.ascontiguousarray(raster[: rows * factor, : columns * factor])
+        return np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA))
+
+    return replace(
+        map_product,
+        appearance=average(map_product.appearance),
+        elevation_m=average(map_product.elevation_m),
+        origin_m=map_product.origin_m + 0.5 * (factor - 1) * map_product.pixel_m,
+        pixel_m=factor * map_product.pixel_m,
+    )
 
 
 def inside_map(map_product: MapProduct, points: Float[np.ndarray, "*shape 2"]) -> Bool[np.ndarray, "*shape"]:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
@@ -15,23 +14,11 @@ from marsyard.sim.camera import CameraModel
 #: Spacing of the points that are projected with the full camera model, coarse pixels; a fisheye of 90 deg deviates from
 #: bilinear interpolation between them by less than a tenth of an image pixel.
 _NODE_STEP = 4
-
-
-def bin_map(map_product: MapProduct, factor: int) -> MapProduct:
-    """Average blocks of `factor` x `factor` map pixels; incomplete blocks at the upper ends are left out."""
-    rows, columns = (extent // factor for extent in map_product.appearance.shape)
-
-    def average(raster: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
-        cropped = np.ascontiguousarray(raster[: rows * factor, : columns * factor])
-        return np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA))
-
-    return replace(
-        map_product,
-        appearance=average(map_product.appearance),
-        elevation_m=average(map_product.elevation_m),
-        origin_m=map_product.origin_m + 0.5 * (factor - 1) * map_product.pixel_m,
-        pixel_m=factor * map_product.pixel_m,
-    )
+#: Size of a binned image pixel at the nadir before rounding, coarse pixels. The factor is rounded to a power of two;
+#: the binned pixel has 0.5 to 1 coarse pixels, unless the image is coarser. `sample_averages` interpolates the image
+#: at points half a coarse pixel apart. These points omit no image pixel if it has at least 0.5 coarse pixels. Image
+#: pixels above 1 coarse pixel would lose detail of the coarse map.
+_BINNED_PIXEL = 0.7
 
 
 @dataclass(frozen=True)
@@ -65,8 +52,7 @@ def view_ground(image: PosedImage, height_above_ground_m: float, pixel_m: float)
     """Place an image above a horizontal plane at the measured height of the body's origin above the ground."""
     position = np.array([*image.position_m[:2], height_above_ground_m])
     level = replace(image, position_m=position)
-    # two by two samples per coarse pixel: an image pixel of 0.7 coarse pixels leaves no gap between them
-    binned = level.bin(binning_factor(level, height_above_ground_m, 0.7 * pixel_m))
+    binned = level.bin(binning_factor(level, height_above_ground_m, _BINNED_PIXEL * pixel_m))
     return GroundView(binned, binned.world_camera)
 
 
@@ -88,11 +74,11 @@ def rectify_to_plane(view: GroundView, grid: MapProduct, max_off_nadir_rad: floa
     usable = visible & view.camera.in_frame(pixels) & (off_nadir <= radius)
     size = (_NODE_STEP * (len(columns) - 1), _NODE_STEP * (len(rows) - 1))
     positions = np.arange(size[0]) / _NODE_STEP, np.arange(size[1]) / _NODE_STEP
-    lattice = np.stack(np.meshgrid(*positions), axis=-1)
+    node_positions = np.stack(np.meshgrid(*positions), axis=-1)
     # image pixels (u, v) of all grid pixels, interpolated between the nodes
-    fine = np.stack([sample_raster(pixels[..., k].astype(np.float32), lattice) for k in (0, 1)], axis=-1)
+    fine = np.stack([sample_raster(pixels[..., k].astype(np.float32), node_positions) for k in (0, 1)], axis=-1)
     # a pixel is valid if all nodes around it are
-    valid = sample_raster(usable.astype(np.float32), lattice) > 0.999
+    valid = sample_raster(usable.astype(np.float32), node_positions) > 0.999
     fine = np.where(valid[..., np.newaxis], fine, 0.0).astype(np.float32)
     values = sample_averages(view.image.radiance, fine[np.newaxis])[0]
     return RectifiedImage(values, valid, (int(corner[0]), int(corner[1])))
@@ -109,15 +95,15 @@ def rectify_patches(
     """
     steps = np.arange(side, dtype=np.float64)
     pixels = corners[:, np.newaxis, np.newaxis, :] + np.stack(np.meshgrid(steps, steps), axis=-1)
-    lattice = pixels.reshape(len(corners) * side, side, 2)
-    ground = np.empty((*lattice.shape[:2], 3))
+    grid_rows = pixels.reshape(len(corners) * side, side, 2)
+    ground = np.empty((*grid_rows.shape[:2], 3))
     # the camera is at the estimated position: the ground moves by the negative offset instead
-    ground[..., :2] = grid.origin_m + grid.pixel_m * lattice - offset_m
+    ground[..., :2] = grid.origin_m + grid.pixel_m * grid_rows - offset_m
     below = elevation_at(grid, view.image.position_m[:2] + offset_m)
-    ground[..., 2] = sample_raster(grid.elevation_m, lattice) - below
+    ground[..., 2] = sample_raster(grid.elevation_m, grid_rows) - below
     image_pixels, visible = view.camera.project(ground)
     last = np.array([grid.appearance.shape[1] - 1, grid.appearance.shape[0] - 1])
-    inside = visible & view.camera.in_frame(image_pixels) & np.all((lattice >= 0) & (lattice <= last), axis=-1)
+    inside = visible & view.camera.in_frame(image_pixels) & np.all((grid_rows >= 0) & (grid_rows <= last), axis=-1)
     image_pixels = np.where(visible[..., np.newaxis], image_pixels, 0.0)
     values = sample_averages(view.image.radiance, image_pixels.reshape(len(corners), side, side, 2))
     return values, np.asarray(inside.reshape(len(corners), -1).all(axis=1))

@@ -146,10 +146,9 @@ class SwingDescent(Trajectory):
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Compute the true states at many times. Raises ValueError for times outside the span."""
-        positions, velocities, matrices, rates, forces = kernels.compute_truth(
-            self._compute_states(times_s), self.chain, self.wind.field
-        )
-        return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
+        truth = kernels.compute_truth(self._compute_states(times_s), self.chain, self.wind.field)
+        attitudes = Rotation.from_matrix(truth.attitudes, assume_valid=True)
+        return Motion(times_s, truth.positions, truth.velocities, attitudes, truth.body_rates, truth.specific_forces)
 
     def _compute_states(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
         """Compute the state vectors (`kernels.swing`) at many times. Raises ValueError for times outside the span."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from marsyard.sim.dynamics.kernels.swing import WindField, compute_wind_profile
+from marsyard.sim.dynamics.kernels.wind import AMPLITUDES, WAVE_COLUMNS, WindField, compute_wind_profile
 from marsyard.sim.error_sources import GUSTS
 from marsyard.sim.parameters import Parameters, Positive, bounded_field
 
@@ -65,7 +65,7 @@ class Wind:
         longitudinal = np.diff(2.0 * np.arctan(x)) / np.pi
         variances = np.stack([transverse, transverse, longitudinal], axis=1)
         deviations = p.gust_intensity_m_s * np.sqrt(variances / variances.sum(axis=0))
-        amplitudes = np.tile(deviations, 2) * rng.standard_normal((WAVES, 6))
+        amplitudes = np.tile(deviations, 2) * rng.standard_normal((WAVES, AMPLITUDES))
         return cls(
             WindField(
                 ground_height_m=ground_height_m,
@@ -80,7 +80,7 @@ class Wind:
     @property
     def without_gusts(self) -> Wind:
         """The same mean wind without gusts."""
-        return Wind(self.field._replace(waves=np.zeros((0, 7))))
+        return Wind(self.field._replace(waves=np.zeros((0, WAVE_COLUMNS))))
 
     def velocities(self, heights_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Compute the wind towards east, north and up, m/s, at heights (world z, metres)."""

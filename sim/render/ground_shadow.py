@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import drjit as dr
 import numpy as np
+from jaxtyping import Int64
 
 from marsyard.sim.render.arrays import PeriodicGrid, Values, clip, larger, smaller
 from marsyard.sim.render.cones import Bounds
@@ -99,10 +100,14 @@ def compute_ground_shadow(
     """Compute the shadow of the ground by a sweep along the axis nearest to the sun's azimuth; the sun must be up.
 
     `visible_m` contains minimum and maximum x, then y, of the ground whose shadow is needed; None for all ground. The
-    grid of the shadow is that of a terrain level. If it covers a part of the ground only, its period is shorter.
-    Returns None for a sun in the zenith.
+    grid of the shadow is that of the finest terrain level with at most `SHADOW_SIDE` samples per side. If it covers a
+    part of the ground only, its period is shorter. Returns None for a sun in the zenith. Raises ValueError if every
+    level has more samples.
     """
-    level = int(np.argmax([samples.shape[0] <= SHADOW_SIDE for samples in surface.levels]))
+    level = next((number for number, samples in enumerate(surface.levels) if len(samples) <= SHADOW_SIDE), None)
+    if level is None:
+        sides = ", ".join(str(len(samples)) for samples in surface.levels)
+        raise ValueError(f"no level of the terrain has at most {SHADOW_SIDE} samples per side: {sides}")
     field, spacing = surface.levels[level], surface.spacing_m * 2.0**level
     east, north, up = (float(component) for component in sun.direction)
     along_x = abs(east) > abs(north)
@@ -120,11 +125,10 @@ def compute_ground_shadow(
         bounds = np.reshape(visible_m, (2, 2)) + np.stack([np.minimum(path, 0.0), np.maximum(path, 0.0)], axis=1)
         first = np.floor(bounds[:, 0] / spacing).astype(int) - _BORDER_SAMPLES
         last = np.ceil(bounds[:, 1] / spacing).astype(int) + _BORDER_SAMPLES
-        # the period of the grid is a power of two: sample k is entry k modulo the period
+        # the period of a grid is a power of two
         count = 1 << int((last - first).max()).bit_length()
         if count < len(field):
-            entries = np.arange(count)
-            columns, rows = ((start + ((entries - start) & (count - 1))) & (len(field) - 1) for start in first)
+            columns, rows = (periodic_window(int(start), count, len(field)) for start in first)
             height = height[np.ix_(rows, columns)]
     height = np.ascontiguousarray(height)
     if along_x:
@@ -141,6 +145,17 @@ def compute_ground_shadow(
         Float64(np.hypot(east, north)),
         Float64(height_range_m[1]),
     )
+
+
+def periodic_window(start: int, count: int, period: int) -> Int64[np.ndarray, "count"]:
+    """Return samples of a periodic axis that form a periodic axis with the shorter period `count`.
+
+    Samples `start` to `start + count - 1` are selected. Sample n is entry n modulo `count`, so that coordinates do not
+    change. The result contains samples of the original axis, from 0 to `period - 1`.
+    """
+    entries = np.arange(count)
+    samples = start + (entries - start) % count
+    return np.asarray(samples % period)
 
 
 def disc_above(offset: Values) -> Values:

@@ -203,11 +203,11 @@ def octave_heights(
 ) -> tuple[float, Float64Array[np.ndarray, "octaves"]]:
     """Compute the cell size of the coarsest octave and the amplitude of each octave of height noise, metres.
 
-    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`) with the Hurst
-    exponent H and the wavenumber k0 of the outer scale. Its correlation function c is Matérn's. Its variance follows
-    from the slope over the baseline L: ``(tan(slope) L)**2 = 2 variance (1 - c(L))``. An octave from k1 = k / sqrt(2)
-    to k2 = k sqrt(2) around the wavenumber k has the fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of
-    this variance.
+    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.random_fields.Spectrum`) with the
+    Hurst exponent H and the wavenumber k0 of the outer scale. Its correlation function c is Matérn's. Its variance
+    follows from the slope over the baseline L: ``(tan(slope) L)**2 = 2 variance (1 - c(L))``. An octave from
+    k1 = k / sqrt(2) to k2 = k sqrt(2) around the wavenumber k has the fraction
+    ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of this variance.
     """
     k0 = 2.0 * np.pi / outer_scale_m
     scaled_lag = k0 * baseline_m

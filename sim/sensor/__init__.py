@@ -4,6 +4,7 @@ The instruments of rovers are in the modules `mast` and `odometry`.
 """
 
 from marsyard.sim.sensor.altimeters import LaserParameters, RadarAltimeter, RadarParameters, height_above_ground
+from marsyard.sim.sensor.approach import Approach, ApproachParameters, NavigationErrors
 from marsyard.sim.sensor.auto_exposure import AutoExposure, AutoExposureParameters, auto_expose
 from marsyard.sim.sensor.custom_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 from marsyard.sim.sensor.detector import Detector, DetectorParameters
@@ -11,7 +12,7 @@ from marsyard.sim.sensor.detector_choice import DetectorChoice, read_datasheet
 from marsyard.sim.sensor.gps import Gps, GpsParameters
 from marsyard.sim.sensor.image_motion import ImageMotion
 from marsyard.sim.sensor.imu import Imu, ImuParameters, WarmUp
-from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
+from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
 from marsyard.sim.sensor.optics import natural_fall_off
 from marsyard.sim.sensor.presets import PRESETS, CameraDesign, preset

@@ -11,7 +11,7 @@ import numpy as np
 
 from marsyard.sim.array_cache import CacheWarning, load_array, save_array
 from marsyard.sim.cache import cache_directory, evict_files, touch
-from marsyard.sim.terrain.landforms.ground import substream
+from marsyard.sim.streams import substream
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField

@@ -15,6 +15,12 @@ from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_fiel
 from marsyard.sim.terrain.environment import Environment
 from marsyard.sim.terrain.parameters import TerrainParameters
 
+#: Size of the coarsest cells of albedo texture of the ground and of rocks, m. Assumed: two samples of a descent's
+#: terrain at the default spacing, which resolves coarser variation; and a part of the face of a large rock.
+GROUND_TEXTURE_M, ROCK_TEXTURE_M = 3.0, 0.2
+#: Lower bound of the cells of texture, m: that of the micro-relief (`marsyard.sim.render.texture`).
+FINEST_TEXTURE_M = 0.001
+
 
 class SitePhotometry(Parameters):
     """Parameters of the Lunar-Lambert law with an opposition surge; see `marsyard.sim.render.Photometry`."""
@@ -130,14 +136,16 @@ def sites() -> dict[str, Site]:
         entry["environment"] = _merge_base(tables["environments"][entry["environment"]], tables["environments"])
         for scale in {"descent", "ground"} & set(entry):
             entry[scale] = _merge_base(entry[scale], tables["grounds"])
-        for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
-            # cells from `coarsest_m` down to 1 mm; the amplitude of each octave is multiplied by `decay`
-            first_amplitude, decay = entry[texture]["amplitude"], entry[texture]["decay"]
-            octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
-            amplitudes = tuple(round(first_amplitude * decay**n, 5) for n in octaves)
-            entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
+        entry["ground_texture"] = _create_texture(GROUND_TEXTURE_M, **entry["ground_texture"])
+        entry["rock_texture"] = _create_texture(ROCK_TEXTURE_M, **entry["rock_texture"])
         sites_by_name[name] = Site(name=name, **entry)
     return sites_by_name
+
+
+def _create_texture(coarsest_m: float, amplitude: float, decay: float) -> SiteTexture:
+    """Create octaves down to `FINEST_TEXTURE_M`; `amplitude` of the first is multiplied by `decay` with each octave."""
+    octaves = range(int(np.log2(coarsest_m / FINEST_TEXTURE_M)) + 1)
+    return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(round(amplitude * decay**n, 5) for n in octaves))
 
 
 def _merge_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:

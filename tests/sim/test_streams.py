@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, stream_words
-from marsyard.sim.streams import Streams, stream_key
+from marsyard.sim.streams import Streams, stream_key, substream
 
 
 def _draw_first_numbers(streams: Streams, name: str) -> tuple[int, ...]:
@@ -21,6 +21,16 @@ def test_stream_depends_only_on_its_key() -> None:
     streams.generator("wind").standard_normal(100)
     assert _draw_first_numbers(streams, "wind") == expected
     assert _draw_first_numbers(Streams(7, "campaign", 3), "wind") == expected
+
+
+def test_substreams_depend_only_on_their_name() -> None:
+    rng = np.random.default_rng(7)
+    first = substream(rng, "dunes").random(3)
+    rng.random(100)
+    rng.spawn(2)
+    np.testing.assert_array_equal(substream(rng, "dunes").random(3), first)
+    assert not np.array_equal(substream(rng, "lava").random(3), first)
+    assert not np.array_equal(substream(np.random.default_rng(8), "dunes").random(3), first)
 
 
 @given(

@@ -1,6 +1,4 @@
-"""Compiled equations of motion of the two-stage pendulum, and the wind that acts on it as a function of height.
-
-`marsyard.sim.dynamics.swing` defines equations and symbols, `marsyard.sim.dynamics.wind` the wind's model.
+"""Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` defines equations and symbols.
 
 A state vector has 22 components: position and velocity of the canopy, unit vector along the line (downwards) and its
 time derivative, direction of the lander's axis and its time derivative, and the lander's x axis (three components each,
@@ -15,52 +13,11 @@ from numba import njit
 from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
+from marsyard.sim.dynamics.kernels.wind import WIND_SCALARS, WindField, compute_wind
+
 Array = NDArray[np.float64]
 #: Index of the first component of each vector in a state, and the size of a state.
 CANOPY, CANOPY_VELOCITY, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
-
-
-class WindField(NamedTuple):
-    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.wind.Wind`.
-
-    Columns of `waves`: wavenumber, rad/m; amplitudes east, north and up of the cosine; then of the sine, m/s.
-    """
-
-    ground_height_m: float
-    mean_east_m_s: float
-    mean_north_m_s: float
-    layer_m: float
-    roughness_m: float
-    waves: Array
-
-
-@njit(cache=True)
-def compute_wind(height: float, field: WindField) -> tuple[float, float, float]:
-    """Compute the east, north and upward wind at a world z, m/s."""
-    altitude = max(height - field.ground_height_m, 0.0)
-    profile = 1.0
-    if altitude < field.layer_m:
-        profile = math.log1p(altitude / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
-    east = profile * field.mean_east_m_s
-    north = profile * field.mean_north_m_s
-    up = 0.0
-    for k in range(field.waves.shape[0]):
-        wave = field.waves[k]
-        cosine = math.cos(wave[0] * height)
-        sine = math.sin(wave[0] * height)
-        east += wave[1] * cosine + wave[4] * sine
-        north += wave[2] * cosine + wave[5] * sine
-        up += wave[3] * cosine + wave[6] * sine
-    return east, north, up
-
-
-@njit(cache=True)
-def compute_wind_profile(heights: Array, field: WindField) -> Array:
-    """Compute the wind at many heights, a row (east, north, up) each."""
-    rows = np.empty((heights.size, 3))
-    for i in range(heights.size):
-        rows[i] = compute_wind(heights[i], field)
-    return rows
 
 
 class Chain(NamedTuple):
@@ -91,8 +48,6 @@ class Chain(NamedTuple):
 
 
 CHAIN_SIZE = len(Chain._fields)
-#: Number of fields of a wind field without the waves.
-FIELD_SIZE = len(WindField._fields) - 1
 
 
 @njit(cache=True)
@@ -130,14 +85,15 @@ def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Arr
     They are arrays, because numba converts named tuples slowly.
     """
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
-    wind = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
-    rates: Array = compute_derivatives(y, chain, WindField(wind[0], wind[1], wind[2], wind[3], wind[4], waves))
+    ground_height, mean_east, mean_north, layer, roughness = to_fixed_tuple(constants[CHAIN_SIZE:], WIND_SCALARS)
+    field = WindField(ground_height, mean_east, mean_north, layer, roughness, waves)
+    rates: Array = compute_derivatives(y, chain, field)
     return rates
 
 
 def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
     """Convert the constants of chain and wind to arrays: the last two arguments of `state_derivative`."""
-    return np.array([*chain, *field[:FIELD_SIZE]]), field.waves
+    return np.array([*chain, *field[:WIND_SCALARS]]), field.waves
 
 
 @njit(cache=True)
@@ -193,9 +149,24 @@ def compute_derivatives(y: Array, chain: Chain, field: WindField) -> Array:
     return rates
 
 
+class CameraMotion(NamedTuple):
+    """True motion of the camera, a row per time, SI units.
+
+    - positions, velocities: world axes
+    - attitudes: rotation matrices from body to world axes
+    - body_rates, specific_forces: body axes
+    """
+
+    positions: Array
+    velocities: Array
+    attitudes: Array
+    body_rates: Array
+    specific_forces: Array
+
+
 @njit(cache=True)
-def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
-    """Compute true position, velocity, attitude (body to world), body rate and specific force of the camera."""
+def compute_truth(states: Array, chain: Chain, field: WindField) -> CameraMotion:
+    """Compute the true motion of the camera in the given states."""
     count = states.shape[0]
     positions, velocities = np.empty((count, 3)), np.empty((count, 3))
     body_rates, forces = np.empty((count, 3)), np.empty((count, 3))
@@ -222,4 +193,4 @@ def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array,
         for j in range(3):
             body_rates[k, j] = _dot(matrices[k, :, j], rotation)
             forces[k, j] = _dot(matrices[k, :, j], force)
-    return positions, velocities, matrices, body_rates, forces
+    return CameraMotion(positions, velocities, matrices, body_rates, forces)

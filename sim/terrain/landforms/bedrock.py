@@ -8,8 +8,9 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, resample
+from marsyard.sim.terrain.landforms.ground import TerrainGround, resample
 from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, expose_strata
+from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 
 _ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.
 #: Sizes of the slabs of the two generations of joints, relative to the parameter, and their relative heights (assumed).

@@ -13,9 +13,10 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.bedrock import locate_points
-from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
+from marsyard.sim.terrain.landforms.ground import TerrainGround, refine, resample
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
 from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, raise_cones, stamp_lobes
+from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean

@@ -15,8 +15,9 @@ from scipy.ndimage import gaussian_filter
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.craters import crater_freshness
-from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround, refine
+from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, refine
 from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, scale_roughness, stamp_streaks
+from marsyard.sim.terrain.landforms.random_fields import Spectrum
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
 

@@ -7,8 +7,9 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, draw_smooth_fields, resample
+from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, resample
 from marsyard.sim.terrain.landforms.kernels.wind import Bedforms, add_dunes, cast_lee
+from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 
 SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 

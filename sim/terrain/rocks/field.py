@@ -16,7 +16,7 @@ from numpy.random import Generator
 from pydantic import Field, model_validator
 
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.terrain.landforms.ground import substream
+from marsyard.sim.streams import substream
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
 from marsyard.sim.terrain.rocks.shapes import FINEST, SHAPES_OF_FORM, max_pixels, rock_shapes

@@ -10,7 +10,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from marsyard.sim.dynamics.kernels.swing import Chain, WindField, compute_aerodynamic_force, compute_derivatives
+from marsyard.sim.dynamics.kernels.swing import Chain, compute_aerodynamic_force, compute_derivatives
+from marsyard.sim.dynamics.kernels.wind import WindField
 from marsyard.sim.dynamics.pendulum import Modes, SwingParameters, build_chain
 from marsyard.sim.dynamics.swing import SwingDescent
 

@@ -10,12 +10,18 @@ from scipy.spatial.transform import Rotation
 from benchmarks.validation.raycast import Ground, cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun, ground_shadow
 from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.casters import are_occluded, casters_towards
 from marsyard.sim.render.cones import ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool, UInt32
-from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.ground_shadow import (
+    GroundShadow,
+    compute_ground_shadow,
+    is_sun_above_slopes,
+    periodic_window,
+    slope_bounds,
+)
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from tests.sim.scenes import DOWN, LAMBERT, NEAR_MESH, descent_camera, level_plate, look_down, make_ground, rocks_near
@@ -198,6 +204,21 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
         grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full_grid, area_grid)
     )
     np.testing.assert_array_equal(area_values, full_values)
+
+
+def test_shadow_needs_a_level_with_few_enough_samples(terrain: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ground_shadow, "SHADOW_SIDE", len(terrain.levels[-1]) - 1)
+    sun = Sun(direction(np.radians(20.0), np.radians(35.0)))
+    with pytest.raises(ValueError, match="no level of the terrain has at most"):
+        compute_ground_shadow(terrain, sun, (0.0, 1.0))
+
+
+@pytest.mark.parametrize(("start", "selected"), [(0, [0, 1, 2, 3]), (6, [0, 1, 6, 7]), (-3, [0, 5, 6, 7])])
+def test_periodic_window_keeps_coordinates_modulo_its_period(start: int, selected: list[int]) -> None:
+    """Four of eight samples, also across the ends of the axis."""
+    window = periodic_window(start, 4, 8)
+    assert sorted(window) == selected
+    np.testing.assert_array_equal(window % 4, np.arange(4))
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])

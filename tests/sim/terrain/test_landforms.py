@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell, TerrainGround
 from marsyard.sim.terrain.landforms.bedrock import locate_points
-from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
+from marsyard.sim.terrain.landforms.ground import refine
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
 from marsyard.sim.terrain.landforms.kernels.wind import Bedforms, add_dunes
+from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 from marsyard.sim.terrain.statistics import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
@@ -186,16 +187,6 @@ def test_landforms_on_a_coarser_grid_have_the_same_position() -> None:
     coarse.height[4, 8] = 1.0
     ground.add(coarse)
     assert tuple(map(int, np.unravel_index(ground.height.argmax(), (64, 64)))) == (16, 32)
-
-
-def test_substreams_depend_only_on_their_name() -> None:
-    rng = np.random.default_rng(7)
-    first = substream(rng, "dunes").random(3)
-    rng.random(100)
-    rng.spawn(2)
-    np.testing.assert_array_equal(substream(rng, "dunes").random(3), first)
-    assert not np.array_equal(substream(rng, "lava").random(3), first)
-    assert not np.array_equal(substream(np.random.default_rng(8), "dunes").random(3), first)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from scipy.ndimage import map_coordinates
 
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
-from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum
+from marsyard.sim.terrain.landforms.random_fields import FractalField, Spectrum
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ from marsyard.sim.terrain import (
     synthesise,
 )
 from marsyard.sim.terrain.landforms.craters import CRATER
-from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
+from marsyard.sim.terrain.landforms.ground import TerrainGround
+from marsyard.sim.terrain.landforms.random_fields import Spectrum
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
