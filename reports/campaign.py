@@ -29,7 +29,8 @@ from marsyard.reports.presentation import presentations
 from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.rare import rare_section, rare_sentences
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
-from marsyard.reports.robustness_section import robust_sentences, robustness_section, robustness_text
+from marsyard.reports.robustness_section import robustness_section
+from marsyard.reports.robustness_wording import robust_sentences, robustness_text
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Section, SectionMaker, Subject
 from marsyard.reports.signature import sign_report

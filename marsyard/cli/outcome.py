@@ -22,7 +22,7 @@ from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.looks import record_look
 from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.robustness_section import robustness_text
+from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count

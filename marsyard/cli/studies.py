@@ -241,7 +241,8 @@ def _finish_robust(run: Path) -> NoReturn:
     """Write the report of a run, print its robustness, and exit."""
     from marsyard.cli.outcome import evaluate_and_store
     from marsyard.cli.terminal import grid_table
-    from marsyard.reports.robustness_section import change_grid, robustness_text, variant_grid
+    from marsyard.reports.robustness_section import change_grid, variant_grid
+    from marsyard.reports.robustness_wording import robustness_text
 
     evaluation, page = evaluate_and_store(run)
     console = create_console()
