@@ -16,7 +16,7 @@ from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.table import refresh_table
 from marsyard.cli.errors import Exit
 from marsyard.cli.terminal import grid_table
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run

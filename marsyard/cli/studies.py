@@ -328,7 +328,7 @@ def _finish_study(directory: Path, exit_code: int, files: Sequence[str] = ()) ->
     """Write the report of a study, print its sentences, `files`, and the path of the report, and exit."""
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import read
-    from marsyard.reports.campaign import study_sentences, write_report
+    from marsyard.reports.campaign_report import study_sentences, write_report
 
     with report_write_errors("the report"):
         page = write_report(directory)

@@ -24,7 +24,7 @@ from marsyard.campaigns.studies.results import ROBUST_FOLDER
 from marsyard.reports.assurance.argument import draw_case
 from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuranceCase, AssuredRun, build_case
 from marsyard.reports.assurance.signature import signature_path
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
 from marsyard.reports.page_environment import page_environment

@@ -28,7 +28,7 @@ from marsyard.reports.assurance.package import (
     render_case,
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
-from marsyard.reports.campaign import build_report, create_subject
+from marsyard.reports.campaign_report import build_report, create_subject
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.stored import table

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
 from marsyard.campaigns.store.temporary_files import write_atomic
-from marsyard.reports.campaign import VERIFICATION_FILE
+from marsyard.reports.campaign_report import VERIFICATION_FILE
 from marsyard.reports.dashboard import entries as campaign_entries
 from marsyard.reports.dashboard.entries import Entry
 from marsyard.reports.dashboard.requirement_rows import (
