@@ -1,5 +1,6 @@
 """Tests of cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -270,7 +271,7 @@ def test_changed_scene_keeps_no_outdated_shadow(renderer: Renderer) -> None:
     hills = make_ground(0.4 * np.sin(np.linspace(0.0, 8.0 * np.pi, 64, endpoint=False)) * np.ones((64, 1)), 0.5)
     scene = Scene(hills, (8.0, 8.0), Sun(direction(0.5, 0.3)), LAMBERT, level_plate(1), **NEAR_MESH)
     moved = level_plate(2, 13.0)
-    changes = (
+    changes: tuple[Callable[[], Scene], ...] = (
         lambda: scene.with_objects(moved),
         lambda: scene.with_light(Sun(direction(2.5, 0.4)), LAMBERT),
         lambda: scene.with_viewpoint(moved, (14.0, 12.0), 0.2, 60.0, 257),
