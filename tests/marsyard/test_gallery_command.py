@@ -107,8 +107,9 @@ def test_contact_sheet_of_many_images_has_the_fewest_grey_levels() -> None:
     sheet = np.random.default_rng(4).integers(0, 256, (1000, 1000), dtype=np.uint8)
     png = compress_sheet(sheet)
     assert len(png) > SHEET_BYTES
-    levels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert len(np.unique(levels)) == SHEET_GREYS[-1]
+    decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    assert len(np.unique(decoded)) == SHEET_GREYS[-1]
 
 
 def test_map_to_grey_keeps_the_order_of_brightness() -> None:
