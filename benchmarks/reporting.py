@@ -22,7 +22,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 from benchmarks.timing import Measurement
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.signature import sign_report
 
 #: Number of random columns that are added, so that a row has as many columns (99) as one of `dimes-gusev`.

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
-from marsyard.reports.robustness_section import robustness_text
+from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.verdicts import Status
 from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.systems import catalogue

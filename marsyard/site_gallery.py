@@ -21,13 +21,24 @@ from marsyard.site_images import ImageRequest, render_images
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 
 PAGE, SHEET = "index.html", "contact-sheet.png"
-#: Maximum width of the images on the page; JPEG quality of these images and of the full-size files.
-PAGE_WIDTH_PX, PAGE_QUALITY, FULL_QUALITY = 760, 82, 92
-#: Contact sheet: columns, cell size, gap, label height, maximum file size, and the numbers of grey levels to try.
-COLUMNS, CELL_PX, GAP_PX, LABEL_PX, SHEET_BYTES = 4, (240, 180), 8, 22, 300_000
+#: Maximum width of the images on the page.
+PAGE_WIDTH_PX = 760
+#: JPEG quality of the images on the page, and of the full-size files.
+PAGE_QUALITY, FULL_QUALITY = 82, 92
+#: Columns of the contact sheet, and width and height of its cells.
+COLUMNS, CELL_PX = 4, (240, 180)
+#: Gap between the cells of the contact sheet, and height of the label below each.
+GAP_PX, LABEL_PX = 8, 22
+#: Grey levels of background and labels of the contact sheet.
+SHEET_BACKGROUND, SHEET_TEXT = 24, 235
+#: Maximum file size of the contact sheet, and the numbers of grey levels to try for it.
+SHEET_BYTES = 300_000
 SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
-#: Display: percentiles of the signal for black and white, factor applied to the black percentile, gamma exponent.
-BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_FRACTION, GAMMA = 0.5, 99.7, 0.6, 0.65
+#: Percentiles of the signal that are displayed black and white; the black one is multiplied by `BLACK_FRACTION`.
+BLACK_PERCENTILE, WHITE_PERCENTILE = 0.5, 99.7
+BLACK_FRACTION = 0.6
+#: Exponent of displayed grey levels.
+GAMMA = 0.65
 
 #: Images of the gallery: site, camera, and values that replace the camera's defaults.
 VIEWS: Sequence[tuple[str, str, dict[str, Any]]] = (
@@ -150,12 +161,11 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
 
 
 def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
-    """Draw all images, reduced, on one PNG of at most `SHEET_BYTES`, with as many grey levels as possible."""
+    """Draw all images, reduced, on one PNG (`compress_sheet`)."""
     cell_width, cell_height = CELL_PX
     rows = -(-len(images) // COLUMNS)
     size = (rows * (cell_height + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (cell_width + GAP_PX) + GAP_PX)
-    # grey levels: background 24, labels 235
-    sheet = np.full(size, 24, dtype=np.uint8)
+    sheet = np.full(size, SHEET_BACKGROUND, dtype=np.uint8)
     for number, image in enumerate(images):
         top = GAP_PX + number // COLUMNS * (cell_height + LABEL_PX + GAP_PX)
         left = GAP_PX + number % COLUMNS * (cell_width + GAP_PX)
@@ -167,7 +177,15 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         sheet[top : top + cell_height, left : left + cell_width] = cell
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - 8)
-        cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
+        cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, SHEET_TEXT, 1, cv2.LINE_AA)
+    return compress_sheet(sheet)
+
+
+def compress_sheet(sheet: Grey) -> bytes:
+    """Compress a contact sheet to a PNG of at most `SHEET_BYTES`, with as many grey levels as possible.
+
+    If it is larger with each number of `SHEET_GREYS`, it has the last one: a sheet of many images has no size limit.
+    """
     png = b""
     for grey_levels in SHEET_GREYS:
         step = 255.0 / (grey_levels - 1)

@@ -18,7 +18,8 @@ from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, OverallVerdict, combine_verdicts, compute_exit_code
 from marsyard.reports.populations import engine_failed
-from marsyard.reports.robustness import Robustness, evaluate_robustness
+from marsyard.reports.robustness import Robustness
+from marsyard.reports.robustness_evaluation import evaluate_robustness
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.stored import StoredRun, read_columns, read_run, table
 from marsyard.reports.validity import Validity, assess_validity

@@ -19,6 +19,8 @@ from marsyard.reports.wording import NOTHING
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has up to half a megabyte.
 CASES_PER_GROUP = 2
+#: Number of listed cases without a metric: as many as of the three groups.
+_CASES_WITHOUT_METRIC = 3 * CASES_PER_GROUP
 #: Maximum number of violations that the gallery shows.
 MAX_SHOWN_VIOLATIONS = 6
 #: Fixed seeds of the random selection, for reproducible reports.
@@ -41,22 +43,24 @@ def gallery_views(run: StoredRun, violations: Sequence[int]) -> list[GalleryView
 
 
 def gallery_cases(run: StoredRun, violations: Sequence[int] = ()) -> list[int]:
-    """List the cases of the gallery: violations, the case selected for the report, and cases of three groups.
+    """List the cases of the gallery, which have stored products: first violations, then the shown case.
 
-    The groups are the largest errors, no answer, and random cases. All listed cases have stored products. Without a
-    metric, the first cases with products are listed. `violations` are those that the page lists by requirement.
+    Cases of three groups follow, if fewer than `MAX_SHOWN_VIOLATIONS` violations are listed: the largest errors, no
+    answer, and random cases. Without a metric, the first stored cases follow instead.
+
+    violations: those that the page lists by requirement
     """
     shown_violations = [case for case in violations if case in run.stored_cases][:MAX_SHOWN_VIOLATIONS]
     stored_cases = list(run.stored_cases)
     metric = primary_metric(run.frame, run.requirements)
-    if len(stored_cases) <= 1 or metric is None or "case" not in run.all_cases:
-        return list(dict.fromkeys([*shown_violations, *stored_cases[: 3 * CASES_PER_GROUP]]))
+    if run.shown_case is None or len(stored_cases) == 1 or metric is None or "case" not in run.all_cases:
+        return list(dict.fromkeys([*shown_violations, *stored_cases[:_CASES_WITHOUT_METRIC]]))
+    first = list(dict.fromkeys([*shown_violations, run.shown_case]))
     if len(shown_violations) == MAX_SHOWN_VIOLATIONS:
-        return list(dict.fromkeys([*shown_violations, *stored_cases[:1]]))
+        return first
     by_error, without_error = _sort_by_error(run.all_cases[run.all_cases["case"].isin(stored_cases)], metric)
     unanswered = [case for case in stored_cases if case in without_error]
     random_order = np.random.default_rng(_GALLERY_SEED).permutation(stored_cases)
-    first = list(dict.fromkeys([*shown_violations, *stored_cases[:1]]))
     return _select_cases(first, by_error, unanswered, random_order.tolist())
 
 

@@ -1,4 +1,4 @@
-"""Shares of outcomes per size of a fault."""
+"""Fractions of outcomes by type and size of a fault: stacked bars, and a table with an interval for one outcome."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ class ExtraColumn(NamedTuple):
 class OutcomesBySize:
     """Outcomes of cases by type (column `fault`) and size of their fault.
 
-    - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
-      a confidence interval for the last outcome of `styles`
-    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.figure_style.BARS`), in order
-    - cases: heading of the number of rows
+    - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`
+    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.figure_style.BARS`), in the order
+      of bars and columns; the last outcome is the `interval_outcome`
+    - cases: name of the counted rows, such as `Flights`: heading of their number, and label of the axis
     - wording: function that returns fault type and size in words; an unknown size is empty
     """
 
@@ -48,14 +48,18 @@ class OutcomesBySize:
     wording: Callable[[str, float], tuple[str, str]]
     extra_columns: Sequence[ExtraColumn] = ()
 
+    @property
+    def interval_outcome(self) -> str:
+        """Key of the outcome whose fraction has a confidence interval: the last one of `styles`."""
+        return [*self.styles][-1]
+
     def records(self, frame: pd.DataFrame) -> list[dict[str, Any]]:
         """Count the outcomes for each fault type and size; cases without a fault come first."""
         records = []
         for fault, size, rows in rates.group_by_size(frame, "fault", "fault_size", NO_FAULT):
             masks = self.outcomes(rows)
-            last_outcome = [*self.styles][-1]
             counts: dict[str, Any] = {name: int(mask.sum()) for name, mask in masks.items()}
-            counts[f"{last_outcome}_fraction"] = rates.fraction_of(masks[last_outcome], rows)
+            counts[f"{self.interval_outcome}_fraction"] = rates.fraction_of(masks[self.interval_outcome], rows)
             values = {column.key: column.compute(rows) for column in self.extra_columns}
             records.append({"fault": fault, "size": size, "n": len(rows), **counts, **values})
         return records
@@ -66,14 +70,14 @@ class OutcomesBySize:
         if all(record["fault"] == NO_FAULT for record in records):
             return []
         texts = [self.wording(record["fault"], record["size"]) for record in records]
-        last = [*self.styles][-1]
+        interval_label, _ = self.styles[self.interval_outcome]
         head = ["Fault", "Size", self.cases, *(name.capitalize() for name, _ in self.styles.values())]
-        head += [f"{self.styles[last][0].capitalize()}, interval", *(column.heading for column in self.extra_columns)]
+        head += [f"{interval_label.capitalize()}, interval", *(column.heading for column in self.extra_columns)]
         rows = [
             [
                 *(name, size or NOTHING, f"{record['n']:,}"),
                 *(f"{record[outcome]:,} ({percent(record[outcome] / record['n'])})" for outcome in self.styles),
-                rates.interval_text(record[f"{last}_fraction"]),
+                rates.interval_text(record[f"{self.interval_outcome}_fraction"]),
                 *(column.format_value(record[column.key]) for column in self.extra_columns),
             ]
             for record, (name, size) in zip(records, texts, strict=True)

@@ -204,7 +204,7 @@ def page_context(
         "dispersions": dispersion_grid(subject.run),
         "requirement_cases": finder.requirement_cases(),
         "gallery": gallery,
-        "links": {case.case: f"#case-{case.case}" for case in gallery},
+        "links": {case.case: f"#{page_environment.CASE_ANCHOR}{case.case}" for case in gallery},
         "summaries": {case.case: finder.summary(case.case) for case in gallery},
         "provenance": provenance.list_provenance(run),
         "versions": [(name, format_value(version)) for name, version in table(run.recorded("versions")).items()],

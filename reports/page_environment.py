@@ -11,6 +11,11 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+#: Class of the elements of a report's page with lists of cases, from which the dashboard takes excerpts.
+LISTS_CLASS = "lists"
+#: Beginning of the identifier of a case's element in a report's page; the case number follows. Also in `explorer.js`.
+CASE_ANCHOR = "case-"
+
 
 def status_class(word: object) -> str:
     """Return the name of the style of a verdict; a PASS with a qualification has that of MET BY RATE.
@@ -34,6 +39,7 @@ def page_environment() -> Environment:
     )
     environment.filters["status_class"] = status_class
     environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
+    environment.globals |= {"LISTS_CLASS": LISTS_CLASS, "CASE_ANCHOR": CASE_ANCHOR}
     return environment
 
 

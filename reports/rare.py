@@ -26,27 +26,34 @@ def probability_text(value: object) -> str:
 
 
 def rare_sentences(record: Mapping[str, Any]) -> list[str]:
-    """Describe verdict, counting bound, estimate and cost of a study in a record; empty without a result.
-
-    The first sentence contains the verdict, the second the counting bound.
-    """
+    """Describe verdict, counting bound, estimate and cost of a study in a record; empty without a result."""
     study = RARE.read(record)
     if study is None:
         return []
     parameters, result = study
-    decision, limit = result.decision, probability_text(parameters.max_probability)
+    decision = result.decision
     basis = {
         Basis.COUNTING: ", by counting independent cases",
         Basis.SIMULATION: ", by the interval of the simulations; it assumes a continuous margin",
     }.get(decision.basis, "")
     return [
         f"{parameters.requirement}: {result.verdict}{basis}.",
-        f"{_counting_sentence(decision.counting)} The limit is {limit}.",
+        rare_bound_sentence(record),
         _estimate_sentence(parameters.method, decision.interval),
         *filter(None, [decision.reason, *_remedies(decision)]),
         f"The study ran {count(result.cases, 'case')}; {result.violations:,} of them violate the requirement.",
         result.margin_text,
     ]
+
+
+def rare_bound_sentence(record: Mapping[str, Any]) -> str:
+    """Describe the counting bound of a study of rare violations and its limit; empty for another run."""
+    study = RARE.read(record)
+    if study is None:
+        return ""
+    parameters, result = study
+    limit = probability_text(parameters.max_probability)
+    return f"{_counting_sentence(result.decision.counting)} The limit is {limit}."
 
 
 def _counting_sentence(counting: CountingBound) -> str:

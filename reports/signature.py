@@ -10,8 +10,11 @@ from marsyard.reports import explorer
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE
 
-#: Layout of a page, which the dashboard depends on.
-_LAYOUT_FILES = tuple(Path(__file__).parent / "templates" / name for name in ("report.html.j2", "parts.html.j2"))
+#: Layout of a page, and the names of its elements, which the dashboard depends on.
+_LAYOUT_FILES = tuple(
+    Path(__file__).parent / name
+    for name in ("templates/report.html.j2", "templates/parts.html.j2", "page_environment.py")
+)
 #: Hash of page and data with the key of the user who wrote them; others' reports are written again for the dashboard.
 SIGNATURE_FILE = "report.signature"
 

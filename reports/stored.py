@@ -48,6 +48,11 @@ class StoredRun:
     unverified: str = ""
 
     @property
+    def shown_case(self) -> int | None:
+        """The case that the report shows: the recorded one if it is stored, otherwise the first stored case, if any."""
+        return self.stored_cases[0] if self.stored_cases else None
+
+    @property
     def is_truncated(self) -> bool:
         """Whether `frame` contains only the first cases."""
         return len(self.all_cases) > len(self.frame)

@@ -20,7 +20,8 @@ from marsyard.reports import rates
 from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.dispersion_changes import ChangeKind
-from marsyard.reports.robustness import ChangeOutcome, Robustness, select_met
+from marsyard.reports.robustness import ChangeOutcome, Robustness
+from marsyard.reports.robustness_evaluation import select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.reweighted_rates import find_crossing, weighted_rates

@@ -16,7 +16,7 @@ from scipy.stats import norm, poisson, truncnorm
 from benchmarks.validation.records import Check, Measure, min_coverage
 from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.dispersion_changes import Change, ChangeKind, list_changes
-from marsyard.reports.robustness import change_rates
+from marsyard.reports.robustness_evaluation import change_rates
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.reweighted_rates import MIN_EFFECTIVE, Crossing, find_crossing, weighted_rates
 from marsyard.reports.verdicts import Verdict

@@ -16,13 +16,13 @@ from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.table import refresh_table
 from marsyard.cli.errors import Exit
 from marsyard.cli.terminal import grid_table
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.looks import record_look
 from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.robustness_section import robustness_text
+from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count

@@ -103,12 +103,12 @@ def _write_package(runs: list[Path], out: Path, key: Path | None) -> None:
     if key is not None:
         check_key(key)
     with report_write_errors(out), create_folder(out) as folder:
-        case = write_package(runs, folder)
+        argument = write_package(runs, folder)
         if key is not None:
             sign_file(folder / MANIFEST, key)
-    for run in case.runs:
+    for run in argument.runs:
         typer.echo(f"{run.report.campaign}: {run.report.verdict}, {count(run.report.cases, 'case')}")
-    typer.echo(f"claim: {case.root.state}; {count(len(case.defeaters), 'open defeater')}")
+    typer.echo(f"claim: {argument.root.state}; {count(len(argument.defeaters), 'open defeater')}")
     typer.echo(f"package: {out / PAGE}{'' if key else ' (not signed)'}")
     typer.echo(f"to verify: marsyard assure --verify {out}")
 

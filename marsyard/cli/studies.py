@@ -241,7 +241,8 @@ def _finish_robust(run: Path) -> NoReturn:
     """Write the report of a run, print its robustness, and exit."""
     from marsyard.cli.outcome import evaluate_and_store
     from marsyard.cli.terminal import grid_table
-    from marsyard.reports.robustness_section import change_grid, robustness_text, variant_grid
+    from marsyard.reports.robustness_section import change_grid, variant_grid
+    from marsyard.reports.robustness_wording import robustness_text
 
     evaluation, page = evaluate_and_store(run)
     console = create_console()
@@ -327,7 +328,7 @@ def _finish_study(directory: Path, exit_code: int, files: Sequence[str] = ()) ->
     """Write the report of a study, print its sentences, `files`, and the path of the report, and exit."""
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import read
-    from marsyard.reports.campaign import study_sentences, write_report
+    from marsyard.reports.campaign_report import study_sentences, write_report
 
     with report_write_errors("the report"):
         page = write_report(directory)

@@ -10,7 +10,7 @@ from html import escape
 
 
 class ElementKind(StrEnum):
-    """ElementKind of an element, with the prefix of its identifier."""
+    """Kind of an element, with the prefix of its identifier."""
 
     GOAL = "G"
     STRATEGY = "S"
@@ -21,7 +21,7 @@ class ElementKind(StrEnum):
 
 
 class GoalState(StrEnum):
-    """GoalState of a goal, from the least to the most severe."""
+    """State of a goal, from the least to the most severe."""
 
     SUPPORTED = "supported"
     CHALLENGED = "supported, with open defeaters"
@@ -31,7 +31,7 @@ class GoalState(StrEnum):
 
 @dataclass(frozen=True)
 class Element:
-    """An element of the case with the elements that support it, are its context, or challenge it.
+    """An element of the argument with the elements that support it, are its context, or challenge it.
 
     - evidence: file of the package, relative to its folder; empty without one
     - own_state: state that the evidence of the element determines; the state of a goal is the worst below it
@@ -123,8 +123,8 @@ class _Box:
             yield from child.walk()
 
 
-def draw_case(root: Element) -> str:
-    """Draw the case as an SVG document."""
+def draw_argument(root: Element) -> str:
+    """Draw the argument as an SVG document."""
     box = _place(root, 0, _PAD, iter([name for name, _, _ in number_elements(root)]))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD

@@ -1,6 +1,6 @@
 """Assurance case of campaigns: claims, arguments and evidence in the Goal Structuring Notation, with open defeaters.
 
-The case is computed from the files of an assurance package alone (`marsyard.reports.assurance.package`). Notation: GSN
+It is computed from the files of an assurance package alone (`marsyard.reports.assurance.package`). Notation: GSN
 Community Standard, version 3; a defeater is a counter-argument of its dialectic extension.
 """
 
@@ -135,8 +135,8 @@ class AssuranceCase:
         }
 
 
-def build_case(runs: Sequence[AssuredRun], folder: Path) -> AssuranceCase:
-    """Build the case of campaigns from the files of a package. Raises OSError or ValueError if one is invalid."""
+def build_argument(runs: Sequence[AssuredRun], folder: Path) -> AssuranceCase:
+    """Build the argument on campaigns from the files of a package. Raises OSError or ValueError if one is invalid."""
     checks, constants = read_checks(folder / VALIDATION), read_constants(folder / REGISTER)
     factors = tomllib.loads((folder / CREDIBILITY).read_text(encoding="utf-8"))["factors"]
     all_rows = [row for check in checks.values() for row in check.rows]

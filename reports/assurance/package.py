@@ -21,10 +21,10 @@ from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import ROBUST_FOLDER
-from marsyard.reports.assurance.argument import draw_case
-from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuranceCase, AssuredRun, build_case
+from marsyard.reports.assurance.argument import draw_argument
+from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuranceCase, AssuredRun, build_argument
 from marsyard.reports.assurance.signature import signature_path
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
 from marsyard.reports.page_environment import page_environment
@@ -34,7 +34,7 @@ from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.validation_rows import VALIDATION_FILE
 
 #: Files of the package that are computed from its evidence, and the file of the hashes.
-PAGE, CASE, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest.json"
+PAGE, ARGUMENT, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest.json"
 #: Version of the layout of a package.
 SCHEMA = 1
 CONFIRMATIONS = "confirmations.jsonl"
@@ -55,8 +55,8 @@ def write_package(directories: Sequence[Path], folder: Path) -> AssuranceCase:
     names: list[str] = []
     for directory in directories:
         names.append(_write_run(directory, folder, names))
-    case = build_case([read_run_evidence(folder, f"runs/{name}") for name in names], folder)
-    for name, content in render_case(case).items():
+    argument = build_argument([read_run_evidence(folder, f"runs/{name}") for name in names], folder)
+    for name, content in render_argument(argument).items():
         (folder / name).write_text(content, encoding="utf-8")
     manifest = {
         "schema": SCHEMA,
@@ -67,7 +67,7 @@ def write_package(directories: Sequence[Path], folder: Path) -> AssuranceCase:
         "files": hash_files(folder),
     }
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    return case
+    return argument
 
 
 def _write_run(directory: Path, folder: Path, names: Sequence[str]) -> str:
@@ -127,14 +127,14 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
     return AssuredRun(name, report, data, record, head, identity, entries, record_head)
 
 
-def render_case(case: AssuranceCase) -> Mapping[str, str]:
-    """Render the files that are computed from the evidence: the case as JSON, its drawing, and the page."""
-    drawing = draw_case(case.root)
-    content = hide_folders(json.dumps(case.to_json(), indent=1, ensure_ascii=False)) + "\n"
+def render_argument(argument: AssuranceCase) -> Mapping[str, str]:
+    """Render the files that are computed from the evidence: the argument as JSON, its drawing, and the page."""
+    drawing = draw_argument(argument.root)
+    content = hide_folders(json.dumps(argument.to_json(), indent=1, ensure_ascii=False)) + "\n"
     # the drawing escapes all texts
-    context = {"case": case, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
+    context = {"argument": argument, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
     page = page_environment().get_template("assurance.html.j2").render(context)
-    return {CASE: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
+    return {ARGUMENT: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
 
 
 def hash_program() -> str:

@@ -1,4 +1,4 @@
-"""Verification of an assurance package: hashes of all files, chains of rows and confirmations, verdicts, and the case.
+"""Verification of an assurance package: hashes of files, chains of rows and confirmations, verdicts, and argument.
 
 Without a signature, the hashes show accidental changes only: a person who changes a file can also write its new hash.
 The other steps then still find rows, records and claims that contradict each other.
@@ -17,7 +17,7 @@ from typing import Any
 from marsyard.campaigns.definition.identity import stored_definition_hash
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.store.confirmation_record import find_own_entry, read_record
-from marsyard.reports.assurance.case import AssuredRun, build_case
+from marsyard.reports.assurance.case import AssuredRun, build_argument
 from marsyard.reports.assurance.package import (
     CONFIRMATIONS,
     MANIFEST,
@@ -25,19 +25,20 @@ from marsyard.reports.assurance.package import (
     hash_files,
     hash_program,
     read_run_evidence,
-    render_case,
+    render_argument,
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
-from marsyard.reports.campaign import build_report, create_subject
+from marsyard.reports.campaign_report import build_report, create_subject
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
 
-#: Numbers of a verdict that follow from the requirement, the rows and the record of confirmations.
+#: Numbers and texts of a verdict that follow from the requirement, the rows and the record of confirmations.
 _NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "estimate", "lower", "upper")
 _TEXTS = ("statement", "metric", "population", "decide_by", "source", "kind")
+#: Relative difference of equal numbers: rounding errors of another processor.
 _TOLERANCE = 1e-9
 #: Further content of `report.json` that follows from the rows.
 _FROM_ROWS = (
@@ -90,7 +91,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
         if not is_same_program:
             notes.append(f"claims and page by their hashes only; {_describe_program(manifest)}")
         elif len(runs) == len(names):
-            problems += _compare_case(copy, runs)
+            problems += _compare_argument(copy, runs)
             notes.append("claims and page, computed again from the evidence")
     notes.append(f"rows and confirmations of {count(len(names), 'campaign')}, verdicts of {len(runs)}")
     return Verification(tuple(dict.fromkeys(problems)), tuple(notes))
@@ -186,14 +187,14 @@ def _is_equal(first: Any, second: Any) -> bool:
     return bool(first == second)
 
 
-def _compare_case(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:
+def _compare_argument(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:
     """Compare the files that are computed from the evidence, and name the first element that differs."""
     try:
-        case = build_case(runs, folder)
+        argument = build_argument(runs, folder)
     except (OSError, ValueError, KeyError, TypeError) as error:
         yield f"evidence: {_relative(error, folder)}"
         return
-    for name, content in render_case(case).items():
+    for name, content in render_argument(argument).items():
         path = folder / name
         if path.is_file() and path.read_text(encoding="utf-8") == content:
             continue
@@ -201,7 +202,7 @@ def _compare_case(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:
 
 
 def _locate_difference(path: Path, content: str) -> str:
-    """Describe the first element of a case in JSON that differs; empty for other files."""
+    """Describe the first element of an argument in JSON that differs; empty for other files."""
     if path.suffix != ".json" or not path.is_file():
         return ""
     try:

@@ -10,7 +10,7 @@ from typing import Any
 
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.record import reject_links
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.provenance import format_tested_algorithms
 from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.reports.dashboard.entries import Entry
 from marsyard.reports.robustness import Robustness
-from marsyard.reports.robustness_section import reach_text
+from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
 from marsyard.reports.wording import NOTHING, percent
 

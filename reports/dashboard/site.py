@@ -1,8 +1,8 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
 All pages are in the site's folder and need no other files. The reports of campaigns are copied into it, if this user's
-installation wrote them, or are written again. The other pages of a campaign repeat parts of its report, so that no case
-is evaluated or drawn twice. Pages of unchanged campaigns are not written again.
+installation wrote them, or are written again. The other pages of a campaign repeat excerpts of its report, so that no
+case is evaluated or drawn twice. Pages of unchanged campaigns are not written again.
 """
 
 import math
@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
 from marsyard.campaigns.store.temporary_files import write_atomic
-from marsyard.reports.campaign import VERIFICATION_FILE
+from marsyard.reports.campaign_report import VERIFICATION_FILE
 from marsyard.reports.dashboard import entries as campaign_entries
 from marsyard.reports.dashboard.entries import Entry
+from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.dashboard.requirement_rows import (
     MAX_OTHER_VERDICTS,
     RequirementRow,
@@ -33,41 +32,6 @@ from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import read_cases
 from marsyard.reports.verdict_files import requirement_evidence, verification_csv
 from marsyard.reports.wording import NOTHING, percent
-
-#: First and last characters of the lists of cases, and of a case, in `templates/report.html.j2` and its parts.
-_LISTS = '<article class="lists">', "</article>"
-_CASE = '<article id="case-', "</article>"
-
-
-@dataclass(frozen=True)
-class Excerpts:
-    """Lists of cases by requirement (may be empty), and results and images of each case that the report shows."""
-
-    lists: Markup
-    cases: Mapping[int, Markup]
-
-
-def case_file(case: int) -> str:
-    """Return the name of the page of a case."""
-    return f"case-{case}.html"
-
-
-def read_excerpts(report: str) -> Excerpts:
-    """Read the parts of a report page; links to its cases become links to their pages."""
-    lists, parts = _read_parts(report, *_LISTS), _read_parts(report, *_CASE)
-    bodies = {int(head.partition('"')[0]): body for head, _, body in (part.partition(">") for part in parts)}
-
-    def link_pages(part: str) -> Markup:
-        for case in bodies:
-            part = part.replace(f'href="#case-{case}"', f'href="{case_file(case)}"')
-        return Markup(part)  # noqa: S704
-
-    return Excerpts(link_pages("".join(lists)), {case: link_pages(body) for case, body in bodies.items()})
-
-
-def _read_parts(report: str, start: str, end: str) -> list[str]:
-    return [part.partition(end)[0] for part in report.split(start)[1:]]
-
 
 INDEX = "index.html"
 _TEMPLATES = Path(__file__).parents[1] / "templates"

@@ -151,15 +151,15 @@ def draw_maps(products: Products) -> Figure:
     truth = _require(read_ground_truth(products), "truth")
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     map_row, truth_row = figure.subplots(2, 4)
-    degrees, limits = np.degrees(maps.slope_rad), maps.limits
+    degrees = np.degrees(maps.slope_rad)
     median = np.nanmedian(maps.elevation_m)
     max_deviation_m = float(np.nanquantile(np.abs(maps.elevation_m - median), 0.99)) or 1.0
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
     coverage = np.where(truth.covered, 1.0, np.nan)
     maps_by_name = (
         ("elevation (m)", maps.elevation_m - median, truth.elevation_m - median, None),
-        ("roughness (m)", maps.roughness_m, truth.roughness_m * coverage, float(limits[1])),
-        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * coverage, float(np.degrees(limits[0]))),
+        ("roughness (m)", maps.roughness_m, truth.roughness_m * coverage, maps.max_roughness_m),
+        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * coverage, float(np.degrees(maps.max_slope_rad))),
     )
     for upper, lower, (name, map_values, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
         colour_scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}

@@ -59,7 +59,8 @@ class LandingMaps(ElevationMap):
     - safety: 0 safe, 1 unknown, 2 hazard
     - pixels: pixel (u, v) of each cell's centre in the first image; extrapolated if the elevation is unknown
     - site, apriori: row and column of the safe and of the a-priori site; NaN for no site
-    - limits: limits of slope (radians) and roughness (metres), and the lander's diameter (metres)
+    - max_slope_rad, max_roughness_m: limits of the algorithm
+    - lander_diameter_m: diameter of the lander's footprint
     """
 
     roughness_m: MapArray
@@ -69,7 +70,9 @@ class LandingMaps(ElevationMap):
     apriori: Float[np.ndarray, "2"]
     surface_from_camera: Float[np.ndarray, "3 3"]
     world_from_surface: Float[np.ndarray, "3 3"]
-    limits: Float[np.ndarray, "3"]
+    max_slope_rad: float
+    max_roughness_m: float
+    lander_diameter_m: float
     site: Float[np.ndarray, "2"]
 
     def world_to_cell(self, offset_from_nadir_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -110,18 +113,29 @@ def read_images(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], 
 def read_tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
     """Read features and tracks; None if missing."""
     arrays = read_arrays(products, {"features": ("n", 2), "tracked": ("n", 2), "tracks_accepted": ("n",)})
-    return None if arrays is None else TrackedFeatures(arrays[0], arrays[1], arrays[2] > 0.5)
+    if arrays is None:
+        return None
+    features, tracked, accepted = arrays
+    return TrackedFeatures(features, tracked, accepted > 0.5)
 
 
 def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
     """Read motion and structure; None if the motion was not estimated."""
-    rotation, translation, rays = (3, 3), (3,), (4, 3)
-    shapes = {"rotation": rotation, "translation": translation, "frustum_0": rays, "frustum_1": rays}
-    arrays = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
+    names = ("rotation", "translation", "true_rotation", "true_translation", "frustum_0", "frustum_1")
+    shapes = ((3, 3), (3,), (3, 3), (3,), (4, 3), (4, 3))
+    arrays = read_arrays(products, dict(zip(names, shapes, strict=True)), finite=True)
     points = check_shape(products.get("sparse_points"), None, 3)
     if arrays is None or points is None or not len(points):
         return None
-    return EstimatedMotion(arrays[0], arrays[1], (arrays[2], arrays[3]), arrays[4], arrays[5], points)
+    rotation, translation, true_rotation, true_translation, *corner_rays = arrays
+    return EstimatedMotion(
+        rotation=rotation,
+        translation=translation,
+        corner_rays=(corner_rays[0], corner_rays[1]),
+        true_rotation=true_rotation,
+        true_translation=true_translation,
+        points=points,
+    )
 
 
 def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
@@ -130,31 +144,58 @@ def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
     arrays = read_arrays(products, {**shapes, "matches_accepted": ("n",)})
     if arrays is None:
         return None
-    return EpipolarMatches(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4] > 0.5)
+    grid, starts, ends, matched, accepted = arrays
+    return EpipolarMatches(grid, starts, ends, matched, accepted > 0.5)
 
 
 def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     """Read the maps; None if the case has no elevation map."""
     maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), ("v", "u")))
-    if maps is None or min(maps[0].shape) < 2:
+    if maps is None:
+        return None
+    elevation_m, roughness_m, slope_rad, safety = maps
+    if min(elevation_m.shape) < 2:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
-    pixels, cell_m = check_shape(products.get("map_pixels"), *maps[0].shape, 2), _read_positive(products, "cell")
-    if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
+    pixels, cell_m = check_shape(products.get("map_pixels"), *elevation_m.shape, 2), _read_positive(products, "cell")
+    if frames is None or pixels is None or cell_m is None:
         return None
-    is_finite = np.isfinite(pixels).all(axis=-1)
-    if not is_finite.all() and is_finite.sum() >= 3:
-        # extrapolate missing pixels by an affine map fitted to the other pixels; exact for level ground
-        cells = np.concatenate(
-            [np.moveaxis(np.indices(is_finite.shape), 0, -1), np.ones((*is_finite.shape, 1))], axis=-1
-        )
-        affine = np.linalg.lstsq(cells[is_finite], pixels[is_finite], rcond=None)[0]
-        pixels = np.where(is_finite[..., None], pixels, cells @ affine)
+    corner_m, apriori, surface_from_camera, world_from_surface, limits = frames
+    if not np.all(limits > 0.0):
+        return None
+    max_slope_rad, max_roughness_m, lander_diameter_m = limits.tolist()
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
-    names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
-    arrays = dict(zip((*names, "world_from_surface", "limits"), (*maps, *frames), strict=True))
-    return LandingMaps(pixels=pixels, cell_m=cell_m, site=site, **arrays)
+    return LandingMaps(
+        elevation_m=elevation_m,
+        corner_m=corner_m,
+        cell_m=cell_m,
+        roughness_m=roughness_m,
+        slope_rad=slope_rad,
+        safety=safety,
+        pixels=_extrapolate_pixels(pixels),
+        apriori=apriori,
+        surface_from_camera=surface_from_camera,
+        world_from_surface=world_from_surface,
+        max_slope_rad=max_slope_rad,
+        max_roughness_m=max_roughness_m,
+        lander_diameter_m=lander_diameter_m,
+        site=site,
+    )
+
+
+def _extrapolate_pixels(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
+    """Replace pixels that are not finite by an affine map of row and column, which is exact for level ground.
+
+    The map is fitted to the finite pixels. Returns the pixels unchanged if fewer than three are finite.
+    """
+    is_finite = np.isfinite(pixels).all(axis=-1)
+    if is_finite.all() or is_finite.sum() < 3:
+        return pixels
+    rows_columns = np.moveaxis(np.indices(is_finite.shape), 0, -1)
+    cells = np.concatenate([rows_columns, np.ones((*is_finite.shape, 1))], axis=-1)
+    affine = np.linalg.lstsq(cells[is_finite], pixels[is_finite], rcond=None)[0]
+    return np.where(is_finite[..., None], pixels, cells @ affine)
 
 
 def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
@@ -173,7 +214,8 @@ def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
     indices = np.nan_to_num((positions - corner)[..., ::-1] / spacing_m)
     rows, columns = np.moveaxis(np.clip(np.rint(indices), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
     elevation_m = heights[rows, columns] - camera[2, 3]
-    return StoredGroundTruth(positions - camera[:2, 3], elevation_m, maps[0], maps[1], maps[2] > 0.5, maps[3] > 0.5)
+    slope_rad, roughness_m, safe, covered = maps
+    return StoredGroundTruth(positions - camera[:2, 3], elevation_m, slope_rad, roughness_m, safe > 0.5, covered > 0.5)
 
 
 def _read_positive(products: Mapping[str, Any], name: str) -> float | None:

@@ -10,7 +10,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 from playwright.sync_api import Page
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dashboard.site import write_site
 from tests.reports import synthetic_run
 from tests.reports.hda import synthetic_landing

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from docs import results
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
 
 PAGE = """# Page

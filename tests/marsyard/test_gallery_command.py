@@ -15,8 +15,10 @@ from marsyard.site_gallery import (
     PAGE,
     SHEET,
     SHEET_BYTES,
+    SHEET_GREYS,
     VIEWS,
     GalleryImage,
+    compress_sheet,
     draw_contact_sheet,
     map_to_grey,
     write_gallery,
@@ -98,6 +100,16 @@ def test_contact_sheet_is_small(images: list[GalleryImage]) -> None:
     sheet_image = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
     assert sheet_image is not None
     assert len(np.unique(sheet_image)) > 8
+
+
+def test_contact_sheet_of_many_images_has_the_fewest_grey_levels() -> None:
+    """White noise cannot be compressed: 3 bits per pixel for 8 levels."""
+    sheet = np.random.default_rng(4).integers(0, 256, (1000, 1000), dtype=np.uint8)
+    png = compress_sheet(sheet)
+    assert len(png) > SHEET_BYTES
+    decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    assert len(np.unique(decoded)) == SHEET_GREYS[-1]
 
 
 def test_map_to_grey_keeps_the_order_of_brightness() -> None:

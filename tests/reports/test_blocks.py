@@ -19,7 +19,7 @@ from marsyard.reports.blocks import (
     quantile_block,
     rate_block,
 )
-from marsyard.reports.campaign import section_makers, write_report
+from marsyard.reports.campaign_report import section_makers, write_report
 from marsyard.reports.effects import scatter_block
 from marsyard.reports.papers import paper_section
 from marsyard.reports.plots import cumulative_figure

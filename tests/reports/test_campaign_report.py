@@ -15,7 +15,7 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.record import describe_machine
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.report_file import SCHEMA
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import read_report
 from tests.reports.synthetic_run import MakeRun, make_rows

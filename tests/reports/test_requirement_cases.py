@@ -17,7 +17,7 @@ from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.gallery import gallery_cases
+from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation
@@ -191,6 +191,15 @@ def test_violations_precede_other_cases_of_the_gallery(make_run: MakeRun) -> Non
     violations = CaseFinder(run, evaluation.verdicts).worst_violations(2)
     assert len(violations) == 2
     assert gallery_cases(run, violations)[:2] == violations
+
+
+def test_gallery_with_the_maximum_of_violations_adds_only_the_shown_case(make_run: MakeRun) -> None:
+    evaluation = evaluate_run(make_run(make_rows(60, error_scale=4.0), [VELOCITY]))
+    run = replace(evaluation.run, stored_cases=(7, *(case for case in range(60) if case != 7)))
+    assert run.shown_case == 7
+    violations = list(range(10, 10 + MAX_SHOWN_VIOLATIONS))
+    assert gallery_cases(run, violations) == [*violations, 7]
+    assert len(gallery_cases(run, violations[1:])) > len(violations)
 
 
 def test_thumbnail_shows_the_last_image() -> None:

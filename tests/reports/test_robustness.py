@@ -22,8 +22,9 @@ from scipy.stats import norm
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dispersion_changes import ChangeKind, list_changes
-from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, evaluate_robustness
-from marsyard.reports.robustness_section import reach_text, robustness_text
+from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness
+from marsyard.reports.robustness_evaluation import evaluate_robustness
+from marsyard.reports.robustness_wording import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.reweighted_rates import Crossing, find_crossing, population_divergence, weighted_rates
 from marsyard.reports.stored import StoredRun

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.verdict_files import COLUMNS, junit_xml, requirement_evidence, verification_csv

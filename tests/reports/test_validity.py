@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports import validation_rows, validity
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import read_report
 from marsyard.reports.validation_rows import Conditions, RowKind, ValidationRow, read_checks

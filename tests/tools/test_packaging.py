@@ -66,7 +66,7 @@ def test_wheel_works_next_to_modules_of_the_same_names(wheel: Path, tmp_path: Pa
         (working_folder / name).write_text("raise ImportError('the wrong module')\n")
     script = (
         f"import sys; sys.path.insert(1, {str(install_folder)!r})\n"
-        "import marsyard, marsyard.sim.camera, marsyard.reports.campaign\n"
+        "import marsyard, marsyard.sim.camera, marsyard.reports.campaign_report\n"
         f"assert marsyard.__file__.startswith({str(install_folder)!r}), marsyard.__file__\n"
         "from marsyard.cli.app import main\nsys.argv = ['marsyard', 'show', 'dimes-smoke']\nmain()\n"
     )

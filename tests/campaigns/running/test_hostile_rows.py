@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import Status

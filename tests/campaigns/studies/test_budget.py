@@ -23,7 +23,7 @@ from marsyard.campaigns.studies.budget import STREAMS, active_sources, start_bud
 from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.campaigns.studies.results import BudgetParameters, BudgetResult
 from marsyard.reports.budget import budget_sentences
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dashboard.site import write_site
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.systems import scenario_names

@@ -33,7 +33,7 @@ from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.robustness import ChangeOutcome
-from marsyard.reports.robustness_section import reach_text
+from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
 from marsyard.reports.verdicts import Status, Verdict

@@ -15,8 +15,8 @@ import pytest
 
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.assurance.argument import ElementKind, GoalState, number_elements
-from marsyard.reports.assurance.case import AssuranceCase, build_case
-from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
+from marsyard.reports.assurance.case import AssuranceCase, build_argument
+from marsyard.reports.assurance.package import ARGUMENT, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
 from tests.command import marsyard
@@ -25,7 +25,7 @@ from tests.reports.assurance.stored_run import write_stored_run
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssuranceCase]:
-    """Write a package of one campaign of 240 cases; return its folder and its case."""
+    """Write a package of one campaign of 240 cases; return its folder and its argument."""
     folder = tmp_path_factory.mktemp("assured")
     run = write_stored_run(folder / "run")
     (folder / "package").mkdir()
@@ -131,7 +131,7 @@ def test_package_verifies(package: Path) -> None:
             edit_json("report.json", lambda report: report["robustness"][0].update(passes_at=20.0)),
             f"{RUN}/report.json: robustness does not follow from the rows",
         ),
-        (edit_text(CASE, "supported, with open defeaters", "supported"), "case.json: element G"),
+        (edit_text(ARGUMENT, "supported, with open defeaters", "supported"), "case.json: element G"),
         (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
         (change_validation_row, "index.html: the content does not follow"),
@@ -197,8 +197,8 @@ def test_signature_shows_who_wrote_the_hashes(package: Path, tmp_path: Path) -> 
 
 
 def test_case_has_all_kinds_of_defeaters(written: tuple[Path, AssuranceCase]) -> None:
-    folder, case = written
-    texts = [item.text for _, item, _ in case.defeaters]
+    folder, argument = written
+    texts = [item.text for _, item, _ in argument.defeaters]
     beginnings = (
         "The required rate or bound is assumed", "Exploration: the seed was chosen freely", "Missed check (validation)",
         "240 of 240 cases", "Fitted to statistics of Spirit", "Nobody outside of the project", "validation, level 1",
@@ -206,13 +206,13 @@ def test_case_has_all_kinds_of_defeaters(written: tuple[Path, AssuranceCase]) ->
     for beginning in beginnings:
         assert any(text.startswith(beginning) for text in texts), beginning
     # an exploration does not show that its cases are new
-    assert case.root.state in (GoalState.OPEN, GoalState.REFUTED)
-    content = case.to_json()
-    names = [name for name, _, _ in number_elements(case.root)]
+    assert argument.root.state in (GoalState.OPEN, GoalState.REFUTED)
+    content = argument.to_json()
+    names = [name for name, _, _ in number_elements(argument.root)]
     assert [item["id"] for item in content["elements"]] == names
     assert {link["target"] for link in content["links"] if link["type"] == "supportedBy"} <= set(names)
-    assert len([link for link in content["links"] if link["type"] == "challenges"]) == len(case.defeaters)
-    for _, item, _ in number_elements(case.root):
+    assert len([link for link in content["links"] if link["type"] == "challenges"]) == len(argument.defeaters)
+    for _, item, _ in number_elements(argument.root):
         assert not item.evidence or (folder / item.evidence).is_file()
 
 
@@ -221,9 +221,9 @@ def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
     record = (run / "campaign.json").read_text()
     (run / "campaign.json").write_text(record.replace('"bound": 5.0', '"bound": 0.001'))
     (tmp_path / "package").mkdir()
-    case = write_package([run], tmp_path / "package")
-    assert case.root.state is GoalState.REFUTED
-    solution = next(item for _, item, _ in number_elements(case.root) if item.kind is ElementKind.SOLUTION)
+    argument = write_package([run], tmp_path / "package")
+    assert argument.root.state is GoalState.REFUTED
+    solution = next(item for _, item, _ in number_elements(argument.root) if item.kind is ElementKind.SOLUTION)
     assert solution.text.startswith("FAIL: ")
 
 
@@ -321,7 +321,7 @@ def test_robustness_of_the_report_supports_or_challenges_a_verdict(stored: Path)
         {"requirement": "OTHER", "parameter": "haze", "pass_text": "haze 0.8"},
     ]
     texts = [
-        [item.text for _, item, _ in number_elements(build_case([case_run], stored).root)]
+        [item.text for _, item, _ in number_elements(build_argument([case_run], stored).root)]
         for case_run in (run, replace(run, data={"robustness": items}), replace(run, data={"robustness": []}))
     ]
     not_computed = "Robustness against other dispersions: not computed."
@@ -335,7 +335,7 @@ def test_computing_time_and_observed_rate_are_defeaters(stored: Path) -> None:
     run = read_run_evidence(stored, RUN)
     (verdict,) = run.report.verdicts
     timed = replace(verdict, metric="estimation_time_s", scale=60.0, decide_by="estimate")
-    root = build_case([replace(run, report=replace(run.report, verdicts=(timed,)))], stored).root
+    root = build_argument([replace(run, report=replace(run.report, verdicts=(timed,)))], stored).root
     texts = [item.text for _, item, _ in number_elements(root)]
     assert any("assumed to be 60 times slower than the host" in text for text in texts)
     assert "Evaluated by observed rate, not at a confidence." in texts

@@ -15,10 +15,11 @@ from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
 from marsyard.reports import signature
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dashboard.entries import find_campaigns, make_slug, read_entries
+from marsyard.reports.dashboard.excerpts import read_excerpts
 from marsyard.reports.dashboard.requirement_rows import margin_text, requirement_rows, sparkline
-from marsyard.reports.dashboard.site import read_excerpts, write_site
+from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.verdicts import Status, Verdict

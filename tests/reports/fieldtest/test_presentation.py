@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.fieldtest.presentation import field_cells, field_test_section
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import read_run

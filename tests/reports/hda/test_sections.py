@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.effects import estimate_effects
 from marsyard.reports.hda.landing_cases import PAPER
 from marsyard.reports.hda.paper_sections import (

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
 from marsyard.reports.localisation.presentation import (

@@ -1,4 +1,7 @@
-"""Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
+"""Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results.
+
+The files are signed with the user's key, if there is one (`marsyard.reports.signature`).
+"""
 
 import json
 import math
@@ -27,9 +30,10 @@ from marsyard.reports.page_environment import page_environment
 from marsyard.reports.populations import outcome_counts
 from marsyard.reports.presentation import presentations
 from marsyard.reports.provenance import read_algorithms
-from marsyard.reports.rare import rare_section, rare_sentences
+from marsyard.reports.rare import rare_bound_sentence, rare_section, rare_sentences
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
-from marsyard.reports.robustness_section import robust_sentences, robustness_section, robustness_text
+from marsyard.reports.robustness_section import robustness_section
+from marsyard.reports.robustness_wording import robust_sentences, robustness_text
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Section, SectionMaker, Subject
 from marsyard.reports.signature import sign_report
@@ -65,7 +69,10 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 
 
 def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
-    """Write the report of an evaluated campaign into the folder `out`; None for the campaign's folder."""
+    """Write the report of an evaluated campaign into the folder `out`, and sign it; None for the campaign's folder.
+
+    Returns the path of the page. The signature is omitted without a key; the dashboard then writes the report again.
+    """
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
     directory, subject = run.directory if out is None else out, create_subject(evaluation)
     makers = STUDY_SECTIONS if run.recorded("study") else section_makers()
@@ -88,7 +95,7 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     for row in context["verdicts"]:
         row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
-    with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
+    with suppress(StoreError, RuntimeError):  # without a key or a home folder
         sign_report(directory, run.directory)
     return page_file
 
@@ -151,12 +158,12 @@ def study_sentences(record: Mapping[str, Any]) -> list[str]:
 
 def _describe_study(record: Mapping[str, Any]) -> StudySummary | None:
     """Return kind, requirement and main result of a study for `report.json`; None for an ordinary campaign."""
-    study, sentences = table(record.get("study")), study_sentences(record)
+    study = table(record.get("study"))
     if not study:
         return None
-    # the first sentence of a rare study is its verdict, the second the probability
-    main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
-    sentence = "".join(main_sentences) or "The study is not finished."
+    # the first sentence of other studies is their main result
+    main_sentence = rare_bound_sentence(record) or next(iter(study_sentences(record)), "")
+    sentence = main_sentence or "The study is not finished."
     return StudySummary(str(study.get("kind")), str(study.get("requirement") or ""), sentence)
 
 
