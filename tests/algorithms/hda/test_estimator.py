@@ -143,6 +143,7 @@ def test_safe_site_without_smooth_surface_is_on_the_map(
     smooth_m[ground.site_cell] = np.nan
     uncovered = replace(ground, hazards=replace(ground.hazards, smooth_m=smooth_m))
     site = site_world(build_scene(measurements), uncovered)
+    assert site is not None
     np.testing.assert_allclose(site, get_site(estimate), atol=0.05)
 
 
