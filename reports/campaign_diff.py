@@ -94,7 +94,9 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[M
     are_paired = have_same_draws(first, second)
     second_metrics = {metric.name: metric for metric in metrics[1]}
     metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
-    share_terrains = have_same_terrains(first, second)
+    # cases without terrains are independent of each other, as the cases of one and the same terrain
+    has_terrains = any(rates.terrain_groups(frame) is not None for frame in frames)
+    share_terrains = have_same_terrains(first, second) or not has_terrains
     p_values = correct_holm(
         [
             _paired_p_value(frames[0], pair[0], frames[1], pair[1])
@@ -151,7 +153,7 @@ def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str
 
 
 def number_stored_terrains(frame: pd.DataFrame) -> Int[np.ndarray, " n"]:
-    """Return the stored terrain numbers of cases, which are comparable between campaigns."""
+    """Return the stored terrain numbers of cases, which are comparable between campaigns; 0 without any terrain."""
     groups = rates.terrain_groups(frame)
     if groups is None:
         return np.zeros(len(frame), dtype=np.int64)
@@ -179,5 +181,6 @@ def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFr
     groups = rates.terrain_groups(first)
     finite_groups = None if groups is None else groups[first_index][finite]
     if first_metric.is_rate:
-        return compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)[2]
+        _, _, p_value = compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)
+        return p_value
     return symmetry_p_value(second_values[finite] - first_values[finite], finite_groups)

@@ -162,6 +162,7 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     return figure
 
 
+@in_page_style
 def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, bound: float | None) -> Figure | None:
     """Draw errors against a condition (a column); None without cases that have a number for the condition.
 

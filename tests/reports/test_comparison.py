@@ -124,6 +124,13 @@ def test_campaigns_with_different_draws_are_compared_as_two_samples(make_run: Ma
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
 
+def test_campaigns_without_terrains_are_compared_case_by_case(make_run: MakeRun) -> None:
+    first, worse = (make_rows(200, answer_rate=rate).drop(columns="terrain") for rate in (0.9, 0.5))
+    definition = {"parameters": {"site": "meridiani"}}
+    _, comparisons = _compare(make_run(first), make_run(worse, name="worse", definition=definition))
+    assert comparisons["answered"].p_value < 1e-6
+
+
 def test_terrains_of_different_sites_are_not_paired(make_run: MakeRun) -> None:
     # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
     def write_site_run(name: str, seed: int) -> Path:

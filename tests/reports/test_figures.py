@@ -49,6 +49,13 @@ def test_figures_are_well_formed(cases: int, bound: float | None) -> None:
         assert root.get("viewBox")
 
 
+def test_all_figures_have_the_style_of_the_page() -> None:
+    for figure in _draw_all_figures(make_rows(24, answer_rate=1.0), 5.0):
+        assert figure is not None
+        # the page's style has no upper spine; matplotlib's own style has one
+        assert not figure.axes[0].spines["top"].get_visible()
+
+
 def test_missing_data_give_no_figure() -> None:
     frame = make_rows(5, answer_rate=0.0)
     assert error_scatter(frame, METRIC, 5.0) is None
