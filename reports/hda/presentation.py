@@ -12,7 +12,8 @@ import numpy as np
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
-from marsyard.reports.hda.paper_sections import limits_section, run_times_section, touchdown_section
+from marsyard.reports.hda.limits_section import limits_section
+from marsyard.reports.hda.paper_sections import run_times_section, touchdown_section
 from marsyard.reports.hda.products import (
     is_hda_case,
     read_images,

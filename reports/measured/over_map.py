@@ -84,7 +84,7 @@ def _summarise(values: Float[np.ndarray, " n"]) -> str:
 def yield_figure(frame: pd.DataFrame) -> Figure:
     """Draw the yield of each matcher over the height of recorded and rendered images."""
     figure = Figure(figsize=(9.0, 2.8), layout="constrained")
-    for axes, name, index in zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, range(4), strict=True):
+    for index, (axes, name) in enumerate(zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, strict=True)):
         for prefix, filling in (("", figure_style.SERIES[index]), (RENDERED, "none")):
             height, fraction = numbers(frame, prefix + "height_m"), numbers(frame, f"{prefix}{name}_yield")
             style = {"color": figure_style.SERIES[index], "markerfacecolor": filling, "markersize": 5.0}
@@ -111,14 +111,11 @@ def _panels(products: Products, kind: str) -> list[Panel]:
         return []
     if map_image is None or landmarks is None:
         return [Panel(image, title), Panel(text="no pose on the map")]
-    style = {
-        "marker": "o",
-        "linestyle": "none",
-        "markersize": 5.0,
-        "fillstyle": "none",
-        "color": figure_style.SERIES[1],
-    }
-    on_image, on_map = (Mark(landmarks[:, columns], style) for columns in ([0, 1], [2, 3]))
+    style = {"marker": "o", "linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
+    style["color"] = figure_style.SERIES[1]
+    # columns of the product: (u, v) in the image, (u, v) on the map, and score of the match
+    image_pixels, map_pixels, _ = np.split(landmarks, (2, 4), axis=1)
+    on_image, on_map = Mark(image_pixels, style), Mark(map_pixels, style)
     return [Panel(image, f"{title}, {len(landmarks)} landmarks", [on_image]), Panel(map_image, "Its map", [on_map])]
 
 

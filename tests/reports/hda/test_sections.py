@@ -11,13 +11,8 @@ import pytest
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.effects import estimate_effects
 from marsyard.reports.hda.landing_cases import PAPER
-from marsyard.reports.hda.paper_sections import (
-    SizeResult,
-    find_knee,
-    run_times_section,
-    touchdown_section,
-    tracking_curves,
-)
+from marsyard.reports.hda.limits_section import SizeResult, find_knee, tracking_curves
+from marsyard.reports.hda.paper_sections import run_times_section, touchdown_section
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
     MAP_CONDITIONS,
