@@ -42,7 +42,6 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
         confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
     else:
         confidences = (confidence_at(verdict.confidence, looks.risk_fraction),) * 2
-    additional: int | None = None
     if looks.in_first_look is None and looks.risk_fraction < 1.0:
         additional = proportions.additional_cases_needed(n, failures, verdict.probability, confidences[0])
     else:

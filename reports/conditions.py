@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import stats
 
 from marsyard.reports import populations, rates
@@ -65,7 +65,10 @@ CONDITIONS = (
 MAX_VALUES, CASES_PER_VALUE = 12, 10
 #: Other columns of numbers have 2 to `MAX_BINS` intervals with equal numbers of cases, about `CASES_PER_BIN` each.
 CASES_PER_BIN, MAX_BINS = 40, 5
+#: Quantile of the errors whose upper bound is in the tables.
 QUANTILE = 0.99
+#: Name of a bin, and mask of its cases.
+NamedMask = tuple[str, Bool[np.ndarray, " n"]]
 #: Names of the world axes.
 _AXIS_NAMES = {"x": "east", "y": "north", "z": "up"}
 _TERRAINS_NOTE = note_text("common.terrains")
@@ -105,27 +108,36 @@ def conditions_section(subject: Subject) -> Section | None:
     return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
 
 
-def bin_conditions(
-    frame: pd.DataFrame, is_condition: Callable[[str], bool]
-) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
+def bin_conditions(frame: pd.DataFrame, is_condition: Callable[[str], bool]) -> Iterator[tuple[str, list[NamedMask]]]:
     """Yield each condition that varies: its column, and the names and masks of its bins."""
     candidates = [name for name in map(str, frame.columns) if is_condition(name)]
     for prefix in CONDITIONS:
-        columns = [name for name in candidates if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
-        for column in columns[:1]:
-            n_values = frame[column].dropna().nunique()
-            if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:
-                values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
-                masks = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
-                yield column, list(zip(map(plain_value, values), masks, strict=True))
-            elif n_values > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
-                condition_values = numbers(frame, column)
-                finite = condition_values[np.isfinite(condition_values)]
-                bins = int(np.clip(finite.size // CASES_PER_BIN, 2, MAX_BINS))
-                edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, bins + 1)))
-                positions = np.where(np.isfinite(condition_values), np.digitize(condition_values, edges[1:-1]), -1)
-                names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
-                yield column, [(name, positions == index) for index, name in enumerate(names)]
+        columns = (name for name in candidates if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_"))
+        column = next(columns, None)
+        if column is None:
+            continue
+        n_values = frame[column].dropna().nunique()
+        if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:
+            yield column, _bin_by_value(frame[column])
+        elif n_values > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
+            yield column, _bin_by_interval(numbers(frame, column))
+
+
+def _bin_by_value(values: pd.Series) -> list[NamedMask]:
+    """Create a bin for each value, in order."""
+    distinct = sorted(values.dropna().unique(), key=lambda value: (isinstance(value, str), value))
+    return [(plain_value(value), values.eq(value).fillna(False).to_numpy(dtype=np.bool_)) for value in distinct]
+
+
+def _bin_by_interval(values: Float[np.ndarray, " n"]) -> list[NamedMask]:
+    """Create bins of about the same number of cases; each contains its lower end, the last one also its upper end."""
+    is_finite = np.isfinite(values)
+    n_bins = int(np.clip(is_finite.sum() // CASES_PER_BIN, 2, MAX_BINS))
+    # quantiles are equal where many cases have the same value
+    edges = np.unique(np.quantile(values[is_finite], np.linspace(0.0, 1.0, n_bins + 1)))
+    bin_numbers = np.where(is_finite, np.digitize(values, edges[1:-1]), -1)
+    names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
+    return [(name, bin_numbers == index) for index, name in enumerate(names)]
 
 
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:

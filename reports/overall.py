@@ -1,4 +1,7 @@
-"""Verdict of a campaign with several requirements: overall verdict, exit status, and what would decide it."""
+"""Verdict of a campaign with several requirements: overall verdict, exit status, and joint risk of false PASSes.
+
+An undecided campaign also has a remedy: the additional cases that would decide it.
+"""
 
 import math
 from collections.abc import Sequence

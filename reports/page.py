@@ -141,7 +141,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         bounds_text = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} observed"
     else:
         lowest = min(verdict.lower, verdict.probability)
-        # the scale starts below the lower bound and the required rate, and ends at 100 %
+        # the scale ends at 100 %; up to a fifth of it lies below the lower bound and the required rate
         scale_start = max(0.0, lowest - 0.25 * (1.0 - lowest))
         rates = {"estimate": verdict.estimate, "required": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
@@ -220,6 +220,7 @@ def page_context(
         empty_table = tables.CaseTable((), ())
         context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
         return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
+    # the cases of the subject are random: they do not include the nominal case
     context["explorer"], random_run = None, subject.run
     if np.isfinite(numbers(random_run.frame, metric)).any():
         data = explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images)

@@ -18,9 +18,9 @@ from marsyard.reports.wording import count as count_text
 _MAX_EDGE_RATIO = 3.0
 #: If more than this fraction of the errors exceeds `_MAX_EDGE_RATIO` times the bound, the axis ends at this quantile.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
-_BELOW_AXES: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+_LEGEND_BELOW_AXES: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+_LINE_STYLES = ("-", "--", ":", "-.")
 Values = Float[np.ndarray, " n"]
-_LINES = ("-", "--", ":", "-.")
 
 
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
@@ -63,7 +63,7 @@ def cumulative_figure(
     figure, axes = new_axes(6.4, 3.4)
     all_values = np.concatenate([*curves.values()])
     edge = None if bound is None else max(1.25 * bound, axis_edge(all_values, bound))
-    for (name, values), colour, line in zip(curves.items(), SERIES, _LINES * 2, strict=False):
+    for (name, values), colour, line in zip(curves.items(), SERIES, _LINE_STYLES * 2, strict=False):
         if values.size:
             x, fraction = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
             if edge is not None:
@@ -80,7 +80,7 @@ def cumulative_figure(
         axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
         axes.set_xlim(0.0, 1.02 * edge)
         note_beyond(axes, int((all_values > edge).sum()))
-    axes.legend(**_BELOW_AXES)
+    axes.legend(**_LEGEND_BELOW_AXES)
     return figure
 
 
@@ -119,7 +119,7 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
     if limit is not None:
         axes.axvline(limit[1], color=REQUIREMENT, linestyle="--", linewidth=1.2, label=limit[0])
     axes.set(xlabel=labels[0], ylabel=labels[1])
-    axes.legend(**_BELOW_AXES)
+    axes.legend(**_LEGEND_BELOW_AXES)
     return figure
 
 

@@ -195,7 +195,10 @@ def rate_text(rate: PooledRate) -> str:
 
 
 def median_text(values: Float[np.ndarray, " n"], digits: int | None) -> str:
-    """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values."""
+    """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values.
+
+    digits: number of decimals; None for those of `number`
+    """
     if values.size == 0:
         return NOTHING
     low, median, high = (float(value) for value in (values.min(), np.median(values), values.max()))

@@ -268,15 +268,12 @@ class CaseFinder:
 
     def _unusual_driver(self, row: int) -> str:
         """Name the driver with the most unusual value of a case; empty if no value is unusual."""
-        percentiles = [(self._percentile(column, row), column) for column in self._drivers]
-        known = [
-            (abs(percentile - 0.5), percentile, column)
-            for percentile, column in percentiles
-            if percentile == percentile
-        ]
-        if not known or 2.0 * max(known)[0] < _USUAL:
+        percentiles = {column: self._percentile(column, row) for column in self._drivers}
+        known = {column: percentile for column, percentile in percentiles.items() if not math.isnan(percentile)}
+        column = max(known, key=lambda name: (abs(known[name] - 0.5), known[name], name), default="")
+        if not column or 2.0 * abs(known[column] - 0.5) < _USUAL:
             return ""
-        _, percentile, column = max(known)
+        percentile = known[column]
         unit = split_unit(column)[1]
         value = number(to_float(self._frame[column].iloc[row]))
         fraction, word = (percentile, "lower") if percentile < 0.5 else (1.0 - percentile, "higher")

@@ -119,8 +119,8 @@ def _case_table(
     for index in order[:_MAX_CASES].tolist():
         case = str(frame["case"].iloc[index]) if "case" in frame else str(index)
         texts = [_cell_text(frame, name, index) for name in ("outcome", *names)]
-        error = _cell_text(frame, "error", index), _cell_text(frame, "traceback", index)
-        rows.append(CaseRow(case, case in with_images, texts, replay_command(run, case), *error))
+        message, trace = _cell_text(frame, "error", index), _cell_text(frame, "traceback", index)
+        rows.append(CaseRow(case, case in with_images, texts, replay_command(run, case), message, trace))
     return CaseTable(["Case", "Outcome", *(label(name) for name in names)], rows, max(0, order.size - _MAX_CASES))
 
 

@@ -127,7 +127,7 @@ def _compare(kind: str, values: Mapping[str, list[pd.Series]], rows: Sequence[Va
         checked = merge_ranges([row.conditions.quantities[name] for row in rows if name in row.conditions.quantities])
         outside = np.logical_or.reduce([_mask_outside(column, checked) for column in columns])
         is_outside |= outside
-        coverage.append(Coverage(name, _summarise(known), checked, int(outside.sum())))
+        coverage.append(Coverage(name, _summarize(known), checked, int(outside.sum())))
     return Domain(kind, int(is_outside.sum()), tuple(coverage))
 
 
@@ -144,7 +144,7 @@ def _mask_outside(values: pd.Series, checked: tuple[Any, ...] | None) -> Bool[np
     return np.asarray(outside & values.notna(), dtype=np.bool_)
 
 
-def _summarise(values: pd.Series) -> tuple[Any, ...]:
+def _summarize(values: pd.Series) -> tuple[Any, ...]:
     """Return the names, or the smallest and the largest number."""
     numbers = pd.to_numeric(values, errors="coerce")
     return (
@@ -153,7 +153,11 @@ def _summarise(values: pd.Series) -> tuple[Any, ...]:
 
 
 def _read_values(run: StoredRun, system: System, items: Sequence[str]) -> Iterator[pd.Series]:
-    """Yield the values of a quantity, one series with a value per case for each column or parameter."""
+    """Yield the values of a quantity, one series with a value per case for each column or parameter.
+
+    items: `System.conditions`: the first known one of the sources of an item, which are separated by `|`, is used; a
+    source is a pattern of columns, or as in `_read_constant`
+    """
     for item in items:
         for source in item.split("|"):
             columns = [name for name in run.frame.columns if fnmatchcase(str(name), source)]
@@ -164,7 +168,10 @@ def _read_values(run: StoredRun, system: System, items: Sequence[str]) -> Iterat
 
 
 def _read_constant(run: StoredRun, system: System, source: str) -> list[pd.Series]:
-    """Read a value that is not a column: a literal, a property of the site's preset, or a parameter; empty without."""
+    """Read a value that is not a column; empty if there is none.
+
+    source: a literal (`=VALUE`), a property of the site's preset (`site.NAME`), or the path of a parameter
+    """
     if source.startswith("="):
         return [pd.Series(source[1:], index=run.frame.index)]
     if source.startswith("site."):

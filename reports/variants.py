@@ -33,7 +33,7 @@ from marsyard.scenarios.columns import split_unit
 _STEPS = 61
 #: Margin that replaces infinite ones, which cannot be interpolated.
 _LARGE = 1e9
-#: Smallest divisor.
+#: Smallest divisor, instead of zero.
 _TINY = 1e-300
 
 
@@ -81,8 +81,8 @@ def read_robust_studies(run: StoredRun) -> list[RobustStudy]:
         if len(stored.frame) != len(parameters.variants) * len(parameters.cases):
             continue
         # the variants of a case follow each other
-        count = len(parameters.variants)
-        frames = [stored.frame.iloc[index::count].reset_index(drop=True) for index in range(count)]
+        n_variants = len(parameters.variants)
+        frames = [stored.frame.iloc[index::n_variants].reset_index(drop=True) for index in range(n_variants)]
         base = rows.loc[list(parameters.cases)].reset_index(drop=True)
         studies.append(
             RobustStudy(list(zip(parameters.variants, frames, strict=True)), base, np.array(parameters.weights))
@@ -135,7 +135,7 @@ def _confidences(verdict: Verdict) -> tuple[float, float]:
 def _widen(
     success: Bool[np.ndarray, " m"], groups: Int[np.ndarray, " m"] | None, confidences: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return factors of both bounds, so that they are at least as wide as those that hold for any correlation.
+    """Return factors of lower and upper bound, with which they hold for any correlation within terrains.
 
     The factors are those of equal weights; 1 without shared terrains.
     """
@@ -179,12 +179,17 @@ def evaluate_steps(
 def _find_step(
     study: RobustStudy, verdict: Verdict, path: str, values: Sequence[float], margins: Float64[np.ndarray, "steps n"]
 ) -> Robustness:
-    """Find the value of a parameter at which PASS turns into FAIL; `values` begin with the assumed one."""
+    """Find the value of a parameter at which PASS turns into FAIL.
+
+    - values: assumed value, and the others in the order of their distance from it
+    - margins: margins of the cases at these values; infinite outside the population
+    """
     assumed, farthest = values[0], values[-1]
     positions = np.abs(np.array(values) - assumed)
     grid = np.linspace(0.0, positions[-1], _STEPS)
     finite = np.clip(margins, -_LARGE, _LARGE)
     failure = np.array([np.interp(grid, positions, column) < 0.0 for column in finite.T]).T
+    # a case has a weight where it belongs to the population at the nearest value, or violates the requirement
     nearest = np.abs(grid[:, None] - positions).argmin(axis=1)
     weights = study.weights * ((margins[nearest] < math.inf) | failure)
     groups, confidences = _groups(study.base, np.ones(len(study.base), dtype=np.bool_)), _confidences(verdict)

@@ -151,11 +151,10 @@ def create_speed_block(landings: pd.DataFrame, subject: Subject) -> Block:
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
     ]
-    improved, degraded, *_ = landing_fractions(landings).values()
     data = {
         "landings": len(landings),
-        "reduced_fraction": improved.fraction,
-        "increased_fraction": degraded.fraction,
+        "reduced_fraction": float(np.mean(change < -MIN_SPEED_CHANGE_M_S)),
+        "increased_fraction": float(np.mean(change > MIN_SPEED_CHANGE_M_S)),
         "mean_with_m_s": float(columns[0].mean()),
         "mean_without_m_s": float(columns[1].mean()),
         "largest_gain_m_s": float(-change.min()),

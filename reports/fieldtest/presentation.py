@@ -26,7 +26,7 @@ from marsyard.reports.section import Block, Section, Subject, SvgFigure, build_g
 from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 
-#: pd.DataFrame of the paper's Fig. 11 by (category, run).
+#: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
     (group["category"], row["run"]): row
     for group in read_paper(Path(__file__).with_name("paper.toml"))["fig_11"]

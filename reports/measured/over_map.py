@@ -42,11 +42,11 @@ def map_section(subject: section.Subject) -> section.Section | None:
     rows = [
         ["images", str(counts["images"]), str(counts["rendered"])],
         ["images with a pose", str(counts["recorded_with_pose"]), str(counts["rendered_with_pose"])],
-        *([label(name), *map(_summarise, values)] for name, values in columns.items()),
+        *([label(name), *map(_summarize, values)] for name, values in columns.items()),
         [
             label(f"{RENDERED}pose_error_px"),
-            _summarise(np.empty(0)),
-            _summarise(numbers(frame, f"{RENDERED}pose_error_px")),
+            _summarize(np.empty(0)),
+            _summarize(numbers(frame, f"{RENDERED}pose_error_px")),
         ],
     ]
     figures = []
@@ -72,7 +72,7 @@ def _median(values: Float[np.ndarray, " n"]) -> float | None:
     return float(np.median(finite)) if finite.size else None
 
 
-def _summarise(values: Float[np.ndarray, " n"]) -> str:
+def _summarize(values: Float[np.ndarray, " n"]) -> str:
     """Format the median and the range of known values."""
     finite = values[np.isfinite(values)]
     if not finite.size:

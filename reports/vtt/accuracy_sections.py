@@ -164,9 +164,13 @@ def _create_camera_blocks(runs: pd.DataFrame) -> list[Block]:
     return blocks
 
 
+#: Example of a pointing error of the mast, degrees; the notes name the position error that it causes.
+_POINTING_ERROR_DEG = 0.1
+
+
 def pointing_error_cm(range_m: float) -> float:
-    """Compute the position error caused by a pointing error of 0.1 deg, centimetres."""
-    return 100.0 * range_m * math.radians(0.1)
+    """Compute the position error that `_POINTING_ERROR_DEG` causes at a range, centimetres."""
+    return 100.0 * range_m * math.radians(_POINTING_ERROR_DEG)
 
 
 def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
@@ -184,10 +188,11 @@ def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
         "rover frame. Drift: distance in the last image from the tracked target to the true projection. By Eqs. 1 and "
         f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {stereo} along the line of sight, and 1 px of "
         f"drift is {drift} across it. The measured errors also contain errors of the camera calibration and of the "
-        f"mast's pointing: 0.1 deg is {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
+        f"mast's pointing: {_POINTING_ERROR_DEG:g} deg is {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
     )
     if all(np.isfinite(row["quantile_bound_m"]) for row in cameras):
         return text
+    # the largest of n values is an upper bound of the quantile q at the confidence c if q^n <= 1 - c
     name, min_runs = format_fraction(QUANTILE), math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
     return (
         f"{text} Too few runs: for a camera, the {name} quantile needs at least {round(1.0 / (1.0 - QUANTILE))} runs, "
@@ -291,9 +296,8 @@ def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
         return []
     distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
     is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed_runs = selectable_targets(
-        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
-    )
+    is_completed = np.isfinite(numbers(frame, "position_error_m"))
+    completed_runs = selectable_targets(frame[np.logical_and.reduce([*is_near, is_completed])])
     # factor 300: 3 sigma in centimetres
     rows = []
     for camera in sorted(completed_runs["camera"].unique()):
@@ -323,6 +327,7 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
         )
         paper = [NOTHING] * 3
         if printed_row is not None:
+            # the formula holds in any unit of length
             paper_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
             paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{paper_cm:.1f}"]
         measured = [f"{row[name]:.1f}" for name in ("designation_cm", "untracked_cm", "tracked_cm")]

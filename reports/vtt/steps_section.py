@@ -20,6 +20,8 @@ from marsyard.reports.wording import NOTHING, format_fraction, note_text, number
 #: that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
+#: Maximum difference of a step from that of a result of the paper, degrees or per cent.
+_MAX_STEP_DIFFERENCE = 0.5
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -63,7 +65,7 @@ def steps_section(subject: Subject) -> Section | None:
     grid = build_grid(steps, columns)
     svg_figures = [svg_figure(rate_figure(lines, (xlabel, "targets tracked")), "steps", caption)]
     blocks = [Block(text=motion["text"], figures=svg_figures), Block(grid=grid, note=_STEPS_NOTE)]
-    oblique = _obliquity_grid(subject.frame, "%" if motion["per_cent"] else "deg")
+    oblique = _obliquity_grid(subject.frame, per_cent=bool(motion["per_cent"]))
     if oblique is not None:
         blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=note_text("vtt.obliquity")))
     return Section("steps", "Steps", motion["title"], blocks, {"cells": steps})
@@ -92,6 +94,9 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
         for _, step_rows in line_rows.groupby("step"):
             step = float(step_rows["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             selectable_rows = selectable_targets(step_rows)
+            paper_percentages = (
+                percentage for size, percentage in paper.items() if abs(step - float(size)) < _MAX_STEP_DIFFERENCE
+            )
             cells.append(
                 {
                     "line": line,
@@ -99,9 +104,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                     "good": rates.flag_fraction(selectable_rows, "tracked"),
                     "all_targets": rates.flag_fraction(step_rows, "tracked"),
                     "false_tracks": rates.flag_fraction(selectable_rows, "no_false_track", value=False),
-                    "paper_percent": next(
-                        (percentage for size, percentage in paper.items() if abs(step - float(size)) < 0.5), None
-                    ),
+                    "paper_percent": next(paper_percentages, None),
                 }
             )
     return cells
@@ -119,10 +122,11 @@ def _group_by_line(frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield name, frame[frame[column].eq(value)]
 
 
-def _obliquity_grid(frame: pd.DataFrame, unit: str) -> Grid | None:
+def _obliquity_grid(frame: pd.DataFrame, *, per_cent: bool) -> Grid | None:
     """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities.
 
     Trackers have separate rows; search windows are pooled.
+    per_cent: whether steps are fractions of the distance to the target, not degrees
     """
     if "obliquity_max_deg" not in frame:
         return None
@@ -137,6 +141,6 @@ def _obliquity_grid(frame: pd.DataFrame, unit: str) -> Grid | None:
                 fractions = [rates.flag_fraction(class_rows[class_rows["step"].eq(step)], "tracked") for step in steps]
                 cells = [f"{low:g} to {high:g}", *(f"{fraction.hits:,} of {fraction.n:,}" for fraction in fractions)]
                 rows.append([name, *cells] if has_trackers else cells)
-    scale = 100.0 if unit == "%" else 1.0
+    scale, unit = (100.0, "%") if per_cent else (1.0, "deg")
     head = ["Maximum obliquity (deg)", *(f"{scale * step:.3g} {unit}" for step in steps)]
     return Grid(["Tracker", *head] if has_trackers else head, rows) if rows else None
