@@ -62,7 +62,7 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
 
     Metrics: success of each requirement, errors, "answered", and "came to an end" (the case was completed).
     """
-    frame = read_sampling_design(run.definition).exclude_nominal_case(run.frame)
+    frame = read_sampling_design(run.definition).exclude_nominal_case(run.all_cases)
     metrics: dict[str, Metric] = {}
     terrains = number_stored_terrains(frame)
 

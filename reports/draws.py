@@ -20,9 +20,12 @@ from marsyard.reports.statistics.drivers import rank_correlation
 from marsyard.reports.wording import count
 from marsyard.scenarios.columns import split_unit
 
-#: Width and height of the panel of one distribution, height of a heading and margin of the figure, inches; number of
-#: panels that always fit in a row.
-_WIDTH_IN, _HEIGHT_IN, _HEADING_HEIGHT_IN, _MARGIN_IN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
+#: Width and height of the panel of one distribution, inches, and number of panels that always fit in a row.
+_WIDTH_IN, _HEIGHT_IN, _MIN_PER_ROW = 3.0, 1.9, 4
+#: Margins between the axes and the edges of their panel, which contain tick labels and title, inches.
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.3, 0.25, 0.45, 0.4
+#: Height of a heading, and margin of the figure, inches.
+_HEADING_HEIGHT_IN, _MARGIN_IN = 0.45, 0.15
 #: Side of the panel of two parameters, inches, and maximum number of parameters that are drawn in pairs.
 _CELL_SIDE_IN, MAX_PAIRED = 0.95, 24
 _CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
@@ -90,9 +93,9 @@ def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     _write_heading(figure, upper_height + lower_height, heading)
     for index, sample in enumerate(samples):
         row, column = divmod(index, n_columns)
-        # the margins around the axes contain the title and the tick labels
-        corner = (_MARGIN_IN + column * width / n_columns + 0.3, lower_height + (n_rows - 1 - row) * _HEIGHT_IN + 0.45)
-        _draw_marginal(_add_axes(figure, corner, (width / n_columns - 0.55, _HEIGHT_IN - 0.85)), sample)
+        left, bottom = _MARGIN_IN + column * width / n_columns, lower_height + (n_rows - 1 - row) * _HEIGHT_IN
+        size = width / n_columns - _LEFT_IN - _RIGHT_IN, _HEIGHT_IN - _BOTTOM_IN - _TOP_IN
+        _draw_marginal(_add_axes(figure, (left + _LEFT_IN, bottom + _BOTTOM_IN), size), sample)
     if pairs_side:
         _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
         left = _MARGIN_IN + 0.5 * (width - pairs_side)

@@ -179,7 +179,10 @@ def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
 def page_context(
     run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
 ) -> dict[str, Any]:
-    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases."""
+    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases.
+
+    extra: sections in addition to those that the template contains
+    """
     metric, bound = subject.metric, subject.bound
     crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
     cautions = [crash_text] if overall.crashed else []

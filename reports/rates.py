@@ -1,4 +1,4 @@
-"""Rates and statistics of rows: fractions with confidence intervals, pooled rates, quantiles, and their texts."""
+"""Rates and statistics of rows: fractions with confidence intervals, pooled rates, quantiles, groups, and texts."""
 
 import math
 from collections.abc import Iterator

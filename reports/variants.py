@@ -74,10 +74,10 @@ def read_robust_studies(run: StoredRun) -> list[RobustStudy]:
         if not (directory / RECORD_FILE).is_file() or not (directory / TABLE_FILE).is_file():
             continue
         stored = read_run(directory)
-        if (study := ROBUST.read(stored.record)) is None or "case" not in run.frame:
+        if (study := ROBUST.read(stored.record)) is None or "case" not in run.all_cases:
             continue
-        parameters = study[0]
-        rows = run.frame.set_index("case", drop=False)
+        parameters, _ = study
+        rows = run.all_cases.set_index("case", drop=False)
         if len(stored.frame) != len(parameters.variants) * len(parameters.cases):
             continue
         # the variants of a case follow each other

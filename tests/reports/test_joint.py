@@ -103,9 +103,13 @@ def test_confirmations_share_terrains_also_if_a_case_has_none() -> None:
     """A crashed case without a terrain changes the type of the column, but not the terrains of the others."""
     frame = make_frame(np.random.default_rng(1), 10)
     with_crashes = frame.assign(terrain=[*range(8), np.nan, np.nan])
-    parts = [collect_evidence(rows, REQUIREMENT, INDEPENDENT, has_own_terrains=False) for rows in (frame, with_crashes)]
+    first, second = (
+        collect_evidence(rows, REQUIREMENT, INDEPENDENT, has_own_terrains=False) for rows in (frame, with_crashes)
+    )
+    assert first is not None
+    assert second is not None
     # ten terrains of the first confirmation, and two unknown ones of the second
-    assert parts[0].join(parts[1]).population.terrains == 12
+    assert first.join(second).population.terrains == 12
 
 
 def test_later_confirmations_use_the_sequential_test() -> None:
