@@ -125,8 +125,9 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
     expected = None if sample.expected is None else sample.to_numbers(sample.expected)
     all_values = values if expected is None else np.concatenate([values, expected])
     levels = np.unique(all_values)
-    # categories and few round numbers as bars, other numbers as a histogram with about 1.5 sqrt(n) bins
-    if categories is not None or (levels.size <= _MAX_LEVELS and np.all(levels == np.round(levels, 9))):
+    are_round = levels.size <= _MAX_LEVELS and np.all(levels == np.round(levels, 9))
+    # categories, constants and few round numbers as bars, other numbers as a histogram with about 1.5 sqrt(n) bins
+    if categories is not None or levels.size == 1 or are_round:
         positions = np.arange(levels.size)
         axes.bar(positions, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
         if expected is not None:

@@ -107,10 +107,11 @@ def _arrange_pair(products: Products, pair: int) -> dict[str, list[Panel]]:
         panels = [panel for track in tracks for panel in _template_panels(track)]
         rows["templates"] = panels + [Panel() for _ in range(_CELLS - len(panels))]
     delivered = []
-    for index, (prefix, colour) in enumerate((("template", TEMPLATE), ("match", MATCH))):
+    templates, matches = ("template", TEMPLATE, "templates"), ("match", MATCH, "tracked positions")
+    for index, (prefix, colour, name) in enumerate((templates, matches)):
         marks = [mark for track in tracks for mark in _track_marks(track, prefix, colour)]
         marks += _hint_marks(products, pair, index, images[index].shape)
-        content = f": {('templates', 'tracked positions')[index]}" if tracks else ""
+        content = f": {name}" if tracks else ""
         delivered.append(Panel(images[index], f"Image {pair + index + 1}{content}", marks))
     return rows | {"delivered": _spread(delivered)}
 

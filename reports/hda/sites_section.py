@@ -37,14 +37,22 @@ from marsyard.scenarios.landing.score import CLASS_BOUNDS, CLASS_NAMES
 
 #: Minimum number of values for a cumulative curve.
 MIN_CURVE_VALUES = 5
-#: Classes of the true ground that both images show, best first. All positions within one lander radius of a wide safe
-#: site are also safe.
-GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
-#: Names of the outcomes of `classify_answers`, in the same order; "crashed" means every case that did not finish.
-ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "crashed")
-_GROUND_TEXTS = dict(
-    zip(GROUNDS, ("a wide safe site exists", "only narrow safe sites exist", "no safe site exists"), strict=True)
-)
+#: Classes of the true ground that both images show, best first, with their texts in the table. All positions within one
+#: lander radius of a wide safe site are also safe.
+GROUNDS = {
+    "wide safe site": "a wide safe site exists",
+    "narrow safe site": "only narrow safe sites exist",
+    "no safe site": "no safe site exists",
+}
+#: Names of the outcomes of `classify_answers`, in the same order, with their headings; "crashed" means every case that
+#: did not finish.
+ANSWERS = {
+    "truly safe site": "safe site reported",
+    "unsafe site": "unsafe site reported",
+    "'no safe site'": "'no safe site'",
+    "not converged": "not converged",
+    "crashed": "crashed",
+}
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
@@ -85,10 +93,9 @@ def create_outcome_block(frame: pd.DataFrame) -> Block:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [
-        [_GROUND_TEXTS[ground], *(f"{answer_counts[name]:,}" for name in ANSWERS)]
-        for ground, answer_counts in counts.items()
+        [GROUNDS[ground], *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()
     ]
-    head = ["Ground truth", "safe site reported", "unsafe site reported", *ANSWERS[2:]]
+    head = ["Ground truth", *ANSWERS.values()]
     note = note_text("hda.outcomes")
     grid, data = Grid(head, rows), {"outcomes": counts}
     return Block(heading="Answers by ground truth", grid=grid, note=note, data=data)

@@ -16,8 +16,9 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import paper_section
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.vtt.accuracy_sections import losses_grid, losses_note, table_1_section
+from marsyard.reports.vtt.goal_section import losses_grid, losses_note
 from marsyard.reports.vtt.steps_section import steps_section
+from marsyard.reports.vtt.table_1_section import table_1_section
 from marsyard.reports.vtt.tracking_runs import (
     CHECKOUT_1,
     CHECKOUT_3,

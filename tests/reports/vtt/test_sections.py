@@ -5,13 +5,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.accuracy_sections import (
-    goal_section,
-    losses_grid,
-    measured_accuracy,
-    summarize_cameras,
-    table_1_section,
-)
+from marsyard.reports.vtt.goal_section import goal_section, losses_grid, summarize_cameras
 from marsyard.reports.vtt.paper_sections import (
     regression_section,
     single_run_section,
@@ -20,6 +14,7 @@ from marsyard.reports.vtt.paper_sections import (
 )
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.vtt.steps_section import step_rates, steps_section
+from marsyard.reports.vtt.table_1_section import measured_accuracy, table_1_section
 from marsyard.reports.vtt.tracking_runs import CHECKOUT_1, CHECKOUT_3, PAPER, REGRESSION, TERRAINS
 from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table, set_values
 
