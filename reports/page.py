@@ -179,8 +179,9 @@ def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
 def page_context(
     run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
 ) -> dict[str, Any]:
-    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases.
+    """Create the context of the page's template.
 
+    run: all cases; the subject contains only the random ones, to which statistics, dispersions and figures refer
     extra: sections in addition to those that the template contains
     """
     metric, bound = subject.metric, subject.bound
@@ -218,25 +219,31 @@ def page_context(
         "replay": provenance.replay_command(run, "CASE"),
         "gallery_command": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
-    cases_with_images = [str(case.case) for case in gallery]
+    return context | _error_context(subject, finder, [str(case.case) for case in gallery])
+
+
+def _error_context(subject: Subject, finder: CaseFinder, cases_with_images: Sequence[str]) -> dict[str, Any]:
+    """Create the part of the context about the errors of the page's metric; without contents if there is no metric."""
+    run, metric, bound = subject.run, subject.metric, subject.bound
     if metric is None:
-        empty_table = tables.CaseTable((), ())
-        context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
-        return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
-    # the cases of the subject are random: they do not include the nominal case
-    context["explorer"], random_run = None, subject.run
-    if np.isfinite(numbers(random_run.frame, metric)).any():
-        data = explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images)
+        no_cases = tables.CaseTable((), ())
+        context = {"explorer": None, "error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
+        return context | {"worst": no_cases, "unanswered": no_cases}
+    explorer_context = None
+    if np.isfinite(numbers(run.frame, metric)).any():
+        data = explorer.explorer_data(run, metric, finder.explored_requirements(), cases_with_images)
         script = explorer.read_script()
-        context["explorer"] = {"data": data, "script": script} | {
-            "json": page_environment.embed_json(data), "hash": page_environment.script_hash(script),
+        explorer_context = {
+            "data": data, "json": page_environment.embed_json(data),
+            "script": script, "hash": page_environment.script_hash(script),
         }  # fmt: skip
-    return context | {
-        "error_figures": error_figures(random_run.frame, random_run.all_cases, metric, bound),
-        "driver_figures": driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
-        "statistics": statistics_grid(random_run.all_cases, metric),
-        "worst": tables.worst_cases(random_run, metric, cases_with_images),
-        "unanswered": tables.unanswered_cases(random_run, metric, cases_with_images),
+    return {
+        "explorer": explorer_context,
+        "error_figures": error_figures(run.frame, run.all_cases, metric, bound),
+        "driver_figures": driver_figures(run.frame, metric, bound, run.driver_columns(metric)),
+        "statistics": statistics_grid(run.all_cases, metric),
+        "worst": tables.worst_cases(run, metric, cases_with_images),
+        "unanswered": tables.unanswered_cases(run, metric, cases_with_images),
     }
 
 

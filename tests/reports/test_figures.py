@@ -164,7 +164,8 @@ def test_points_beyond_the_axes_are_marked_and_counted() -> None:
 def test_constant_parameter_has_a_visible_bar() -> None:
     figure = draws_figure("constant", [ParameterSample("sun.optical_depth", [1.0 / 3.0] * 20)])
     (bar,) = (patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle))
-    assert (bar.get_width(), bar.get_height()) == (pytest.approx(0.7), 20.0)
+    assert bar.get_width() == pytest.approx(0.7)
+    assert bar.get_height() == 20.0
 
 
 def _make_draws() -> list[ParameterSample]:
