@@ -95,6 +95,7 @@ def budget_section(subject: Subject) -> Section | None:
 
 
 def _budget_block(result: BudgetResult, budget: Budget, confidence: float) -> Block:
+    """Create figure and table of the contributions of the sources of error."""
     unit, total, n_cases = split_unit(result.quantity)[1], budget.total, result.cases
     root_unit = f", {unit}" if unit else ""
     head = [
@@ -141,6 +142,7 @@ def _format_root(square: float) -> str:
 
 
 def _index_block(result: BudgetResult) -> Block:
+    """Create the table of Sobol's indices."""
     indices = result.indices
     rows = [
         [

@@ -13,7 +13,7 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.outcomes_by_size import NO_FAULT, ExtraColumn, OutcomesBySize
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.statistics.error_summary import circular_error, error_ellipse
 from marsyard.reports.wording import NOTHING, format_fraction, interval, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
@@ -25,18 +25,18 @@ def answers_section(subject: Subject) -> Section | None:
     fractions = answer_fractions(subject)
     if not fractions:
         return None
-    grid = build_grid(
-        fractions.items(),
-        {
-            "": lambda pair: pair[0],
-            "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
-            "Fraction": lambda pair: percent(pair[1].fraction),
-            f"{format_fraction(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
-            "Interval with shared terrains": lambda pair: (
-                NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
-            ),
-        },
-    )
+    rows = [
+        [
+            name,
+            f"{fraction.hits:,} of {fraction.n:,}",
+            percent(fraction.fraction),
+            rates.range_text(fraction.lower, fraction.upper),
+            NOTHING if fraction.shared_lower is None else rates.interval_text(fraction, shared=True),
+        ]
+        for name, fraction in fractions.items()
+    ]
+    head = ["", "Cases", "Fraction", f"{format_fraction(CONFIDENCE)} interval", "Interval with shared terrains"]
+    grid = Grid(head, rows)
     note = note_text("common.answers")
     return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], fractions)
 

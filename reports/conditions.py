@@ -148,17 +148,19 @@ def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]
     finite = np.isfinite(magnitude)
     magnitude, finite_groups = magnitude[finite], None if groups is None else groups[finite]
     components = [rates.finite_values(answered_rows, column) for column in _signed_components(rows, metric)]
+    _, quantile_bound = quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)
     return {
         "name": name,
         "answered": rates.fraction_of(is_answered, rows),
         "means": [float(component.mean()) if component.size else float("nan") for component in components],
         "sds": [float(component.std(ddof=1)) if component.size > 1 else float("nan") for component in components],
-        "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)[1],
+        "quantile_bound": quantile_bound,
         "largest": float(magnitude.max()) if magnitude.size else float("nan"),
     }
 
 
 def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
+    """Create the table of a condition: a row for each of its bins, as `_summarize_bin` summarizes them."""
     columns = _signed_components(frame, metric)
     axes = (
         [""]

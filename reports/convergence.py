@@ -84,8 +84,9 @@ def success_rate_curves(subject: Subject) -> list[Curve]:
     frame, requirements = subject.all_cases, subject.run.requirements
     sizes = curve_sizes(len(frame))
     evaluated = [(size, evaluate_requirements(frame.head(size), requirements, sampling)) for size in sizes]
+    _, final_verdicts = evaluated[-1]
     curves = []
-    for index, final in enumerate(evaluated[-1][1]):
+    for index, final in enumerate(final_verdicts):
         points = [
             Point(size, verdicts[index].estimate, verdicts[index].lower, verdicts[index].upper)
             for size, verdicts in evaluated

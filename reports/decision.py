@@ -146,6 +146,10 @@ def _evaluate(
     sampling: SamplingDesign,
     earlier: RequirementEvidence | None = None,
 ) -> Verdict:
+    """Evaluate a requirement; INSUFFICIENT with a reason if the rows do not allow it, or no case is in its population.
+
+    earlier: evidence of other confirmations of the same claim
+    """
     verdict = _empty_verdict(requirement)
     frame = _complete_columns(frame, verdict)
     problem = _describe_problem(frame, verdict)

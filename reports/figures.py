@@ -135,7 +135,7 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     axes.hist(on_axis, bins=list(bins), color=SERIES[0], alpha=0.85)
     n_beyond = magnitude.size - on_axis.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
-    if n_beyond:  # a hatched bar beyond the axis
+    if n_beyond:  # a hatched bar beyond the axis, separated by a line; positions are relative to the end of the axis
         axes.bar(1.11 * edge, n_beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
         axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
         text, position = f"{n_beyond:,}\n> {edge:.3g}", (1.11 * edge, n_beyond)

@@ -99,20 +99,22 @@ def dispersion_grid(run: StoredRun) -> Grid:
     model = scenario(scenario_name).parameters_type if scenario_name in scenario_names() else None
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, path_parts = table(entry), str(path).split(".")
-        statistics = [NOTHING] * 3
+        minimum, mean, maximum = [NOTHING] * 3
         if path in run.frame:
             values = pd.to_numeric(run.frame[path], errors="coerce").dropna()
-            statistics[1] = f"{run.frame[path].nunique()} values"
+            mean = f"{run.frame[path].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[path].dtype):
-                statistics = [format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
+                minimum, mean, maximum = (
+                    format_value(float(value)) for value in (values.min(), values.mean(), values.max())
+                )
                 if path_parts[-1] == "terrain":
-                    statistics[1] = NOTHING  # the mean of numbers of terrains has no meaning
+                    mean = NOTHING  # the mean of numbers of terrains has no meaning
         # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
         meaning, unit = meaning.split(";")[0], split_unit(path_parts[-1])[1]
         meaning += f" ({unit})" if unit and not meaning.endswith(f", {unit}") else ""
         source = str(dispersion.get("source") or NOTHING)
-        rows.append([meaning, str(path), _distribution_text(dispersion), *statistics, source])
+        rows.append([meaning, str(path), _distribution_text(dispersion), minimum, mean, maximum, source])
     return Grid(["Quantity", "Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
 
 
@@ -227,7 +229,12 @@ def _error_context(subject: Subject, finder: CaseFinder, cases_with_images: Sequ
     run, metric, bound = subject.run, subject.metric, subject.bound
     if metric is None:
         no_cases = tables.CaseTable((), ())
-        context = {"explorer": None, "error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
+        context: dict[str, Any] = {
+            "explorer": None,
+            "error_figures": [],
+            "driver_figures": [],
+            "statistics": Grid((), ()),
+        }
         return context | {"worst": no_cases, "unanswered": no_cases}
     explorer_context = None
     if np.isfinite(numbers(run.frame, metric)).any():

@@ -146,12 +146,12 @@ Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 @in_page_style
 def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool) -> Figure:
     """Draw panels with cases and medians of bins, by x and y labels: a row for each y, a column for each x."""
-    columns, rows = (list(dict.fromkeys(pair[index] for pair in panels)) for index in (0, 1))
-    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
+    x_labels, y_labels = list(dict.fromkeys(x for x, _ in panels)), list(dict.fromkeys(y for _, y in panels))
+    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(y_labels))
     figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
+    grid = figure.subplots(len(y_labels), len(x_labels), squeeze=False, sharex="col", sharey="row")
     for (x, y), (points, medians) in panels.items():
-        axes = grid[rows.index(y), columns.index(x)]
+        axes = grid[y_labels.index(y), x_labels.index(x)]
         axes.plot(*points, ".", color=SERIES[5], markersize=3, rasterized=True)
         axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
@@ -160,9 +160,9 @@ def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, l
             # the page's style does not support superscripts of powers of ten
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
-        if y == rows[-1]:
+        if y == y_labels[-1]:
             axes.set_xlabel(x, fontsize=8)
-        if x == columns[0]:
+        if x == x_labels[0]:
             # the unit has its own line, so that labels of adjacent panels do not overlap
             axes.set_ylabel(y.replace(" (", "\n("), fontsize=8)
     return figure

@@ -201,8 +201,8 @@ def median_text(values: Float[np.ndarray, " n"], digits: int | None) -> str:
     """
     if values.size == 0:
         return NOTHING
-    low, median, high = (float(value) for value in (values.min(), np.median(values), values.max()))
-    texts = [
-        number(value) if digits is None else f"{value:.{digits}f}".replace("-", "−") for value in (median, low, high)
-    ]
-    return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    low, median, high = (
+        number(float(value)) if digits is None else f"{value:.{digits}f}".replace("-", "−")
+        for value in (values.min(), np.median(values), values.max())
+    )
+    return median if low == high else f"{median} ({low} to {high})"

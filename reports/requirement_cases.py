@@ -18,7 +18,7 @@ from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.products import thumbnail
-from marsyard.reports.section import Grid, build_grid
+from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, label, number, percent
@@ -211,6 +211,7 @@ class CaseFinder:
         return CaseSummary(statuses, self._case_drivers(row), previous, following, similar, len(self._run.frame))
 
     def _list_cases(self, item: _Evaluated) -> RequirementCases:
+        """List the violations of a requirement, and the cases nearest to its limit if its margin is graded."""
         violations = item.violations
         met = np.flatnonzero((item.margins >= 0.0) & np.isfinite(item.margins)) if item.graded else np.zeros(0, int)
         nearest = met[np.argsort(item.margins[met], kind="stable")][:MAX_NEAREST]
@@ -222,6 +223,7 @@ class CaseFinder:
         )
 
     def _listed_case(self, item: _Evaluated, row: int) -> ListedCase:
+        """Describe the case in a row of the table for the list of a requirement."""
         values = self._row(row)
         case, violates = int(values["case"]), bool(item.margins[row] < 0.0)
         cause = self._find_cause(item, values)
@@ -313,15 +315,8 @@ class CaseFinder:
             group = str(values.get("outcome", NOTHING)), NOTHING if cause is None else cause.name
             counts[group] += 1
             examples.setdefault(group, int(values["case"]))
-        return build_grid(
-            counts.most_common(),
-            {
-                "Outcome": lambda entry: entry[0][0],
-                "Cause": lambda entry: entry[0][1],
-                "Violations": lambda entry: f"{entry[1]:,}",
-                "Example": lambda entry: f"case {examples[entry[0]]}",
-            },
-        )
+        rows = [[*group, f"{n:,}", f"case {examples[group]}"] for group, n in counts.most_common()]
+        return Grid(["Outcome", "Cause", "Violations", "Example"], rows)
 
 
 def _describe_margin(item: _Evaluated, margin: float) -> tuple[str, str]:

@@ -113,6 +113,7 @@ def _condition_columns(run: StoredRun, metric: str) -> list[str]:
 def _case_table(
     run: StoredRun, order: Int[np.ndarray, " n"], columns: Sequence[str], with_images: Collection[str] = ()
 ) -> CaseTable:
+    """Create the table of the first `_MAX_CASES` rows in an order, with the values of the columns that exist."""
     frame = run.all_cases
     names = [name for name in columns if name in frame]
     rows = []

@@ -20,7 +20,7 @@ from marsyard.reports.hda.landing_cases import PAPER, landing_rows
 from marsyard.reports.plots import RateLine, draw_rates
 from marsyard.reports.populations import flag_mask
 from marsyard.reports.rates import CONFIDENCE, PooledRate, pooled_rate, rate_text
-from marsyard.reports.section import Block, Section, Subject, build_grid, drop_empty_columns, svg_figure
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, drop_empty_columns, svg_figure
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, percent
 
 #: Minimum fraction of tracked features for good tracking.
@@ -91,17 +91,20 @@ def limits_section(subject: Subject) -> Section | None:
             "Minimum fraction within the paper's limit": lambda curve: percent(curve.min_fraction_within_limit),
         },
     )
-    size_grid = build_grid(
-        [(curve.change, point) for curve in curves for point in curve.points],
-        {
-            "Change": lambda pair: pair[0]["name"],
-            "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
-            "Flights": lambda pair: f"{pair[1].flights:,}",
-            "Correctly tracked": lambda pair: rate_text(pair[1].tracked),
-            "Flights with at least 90 %": lambda pair: f"{pair[1].good:,}",
-        },
-    )
-    caption = f"Bars are {format_fraction(CONFIDENCE)} intervals. Dashed: limit of the paper. Dotted: 90 %."
+    good_text = format_fraction(GOOD_FRACTION)
+    rows = [
+        [
+            curve.change["name"],
+            f"{point.size:g} {curve.change['unit']}",
+            f"{point.flights:,}",
+            rate_text(point.tracked),
+            f"{point.good:,}",
+        ]
+        for curve in curves
+        for point in curve.points
+    ]
+    size_grid = Grid(["Change", "Size", "Flights", "Correctly tracked", f"Flights with at least {good_text}"], rows)
+    caption = f"Bars are {format_fraction(CONFIDENCE)} intervals. Dashed: limit of the paper. Dotted: {good_text}."
     figure = svg_figure(limits_figure(curves), "limits", caption, wide=True)
     blocks = [
         Block(text=note_text("hda.limits_text"), figures=[figure]),
@@ -146,15 +149,17 @@ def find_knee(results: Sequence[SizeResult], sign: float) -> float:
     `sign` selects positive (1) or negative (-1) changes. Infinite if all fractions are larger; NaN with fewer than two
     sizes in this direction.
     """
-    points_by_change = sorted(
-        (sign * point.size, point.tracked.fraction) for point in results if sign * point.size >= 0.0
+    fractions_by_size = sorted(
+        (sign * point.size, point.tracked.fraction)
+        for point in results
+        if sign * point.size >= 0.0 and not math.isnan(point.tracked.fraction)
     )
-    points_by_change = [point for point in points_by_change if not math.isnan(point[1])]
-    if len(points_by_change) < 2:
+    if len(fractions_by_size) < 2:
         return math.nan
-    if points_by_change[0][1] < GOOD_FRACTION:
-        return points_by_change[0][0]
-    for (size, fraction), (next_size, next_fraction) in pairwise(points_by_change):
+    smallest_size, first_fraction = fractions_by_size[0]
+    if first_fraction < GOOD_FRACTION:
+        return smallest_size
+    for (size, fraction), (next_size, next_fraction) in pairwise(fractions_by_size):
         if next_fraction < GOOD_FRACTION:
             return size + (next_size - size) * (fraction - GOOD_FRACTION) / (fraction - next_fraction)
     return math.inf

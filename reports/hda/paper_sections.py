@@ -128,10 +128,12 @@ def run_times_section(subject: Subject) -> Section | None:
     durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
     is_complete = np.isfinite(durations).all(axis=1)
     durations, rows_with_times, cases = durations[is_complete], frame[is_complete], int(is_complete.sum())
-    if not cases or not durations.sum() > 0.0:
+    if not cases:
         return None
     medians_s, percentiles_95_s = np.median(durations, axis=0), [rates.quantile(column, 0.95) for column in durations.T]
     paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(medians_s.sum())
+    if total_s <= 0.0:
+        return None
     # the factor scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
     for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s, strict=True):
@@ -140,9 +142,9 @@ def run_times_section(subject: Subject) -> Section | None:
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         seconds = {"paper_s": stage["seconds"], "median_s": median_s, "p95_s": p95_s, "scaled_s": factor * median_s}
         data.append({"name": stage["name"], **seconds, "parameters": text})
-        fractions = [f"{100.0 * stage['seconds'] / paper_total_s:.0f} %", f"{100.0 * median_s / total_s:.0f} %"]
-        times = [f"{stage['seconds']:.2f}", fractions[0], _milliseconds(median_s), fractions[1], _milliseconds(p95_s)]
-        rows.append([stage["name"], *times, stage["parameters"], text])
+        paper_times = [f"{stage['seconds']:.2f}", f"{100.0 * stage['seconds'] / paper_total_s:.0f} %"]
+        times = [_milliseconds(median_s), f"{100.0 * median_s / total_s:.0f} %", _milliseconds(p95_s)]
+        rows.append([stage["name"], *paper_times, *times, stage["parameters"], text])
     totals = [f"{paper_total_s:.2f}", "100 %", _milliseconds(total_s), "100 %", NOTHING]
     rows.append(["Total", *totals, NOTHING, NOTHING])
     times_head = ["Paper (s)", "Fraction of total", "Median here (ms)", "Fraction of total", "95 % quantile here (ms)"]

@@ -113,6 +113,7 @@ def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
+    """Create the table of measured errors, each next to that of the paper for the camera."""
     quantities = ("Designation", "Without tracking", "With tracking")
     pairs = [(f"{name} (cm)", f"Paper: {name.lower()} (cm)") for name in quantities[:2]]
     pairs.append((f"{quantities[2]} (cm)", "Paper's formula: with tracking (cm)"))
