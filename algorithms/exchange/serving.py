@@ -133,9 +133,13 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
 
     The caller must pass it to `release_server` afterwards.
     """
-    if command.persistent and (idle := _idle.pop((command, limits), None)) is not None and idle.child.is_running():
-        idle.child.left_s = limits.total_s
-        return idle
+    idle = _idle.pop((command, limits), None)
+    if idle is not None:
+        if idle.child.is_running():
+            idle.child.left_s = limits.total_s
+            return idle
+        # also removes its folder and its child processes
+        idle.child.stop()
     child = command.start(limits)
     output = child.read_line(time_s=child.max_greeting_s)
     try:
