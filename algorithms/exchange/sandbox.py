@@ -52,7 +52,7 @@ def sandbox_words(
     options += ["--dir", str(working_folder)]
     visible: list[Path] = []
     for path in [*map(Path, _SYSTEM), *_python_folders(), Path(program), *named, *readable]:
-        if not any(path.absolute().is_relative_to(folder) for folder in visible):
+        if not any(path.absolute().is_relative_to(parent) for parent in visible):
             visible.append(path.absolute())
             options += ["--ro-bind-try", str(visible[-1]), str(visible[-1])]
     options += ["--bind", str(folder), str(folder), "--chdir", str(working_folder), "--"]
