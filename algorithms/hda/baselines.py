@@ -128,7 +128,7 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
     rectified_from_first = Rotation.from_matrix(np.stack([baseline_axis, np.cross(axis, baseline_axis), axis]))
     focal = views[0].focal_px
     border_rays = [
-        rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(16))[1]))
+        rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(steps=16))[1]))
         for view, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
     ]
     rays = np.concatenate(border_rays)

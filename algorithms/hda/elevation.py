@@ -105,15 +105,13 @@ def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:
     padded = np.pad(holes, margin, constant_values=True)
     # morphological opening: the parts of holes that a disc of this diameter covers
     wide = dilate(grassfire(~padded) >= radius_cells, radius_cells - 0.5)[margin:-margin, margin:-margin]
+    along_rows = _interpolate_rows(ground.elevation_m)
+    along_columns = [array.T for array in _interpolate_rows(ground.elevation_m.T)]
     sums, weights = np.zeros(holes.shape), np.zeros(holes.shape)
-    for values, axis_sums, axis_weights in (
-        (ground.elevation_m, sums, weights),
-        (ground.elevation_m.T, sums.T, weights.T),
-    ):
-        value, gap = _interpolate_rows(values)
+    for value, gap in (along_rows, along_columns):
         is_known = np.isfinite(value)
-        axis_sums += np.where(is_known, value, 0.0) / gap
-        axis_weights += is_known / gap
+        sums += np.where(is_known, value, 0.0) / gap
+        weights += is_known / gap
     filled = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights > 0.0)
     return replace(ground, elevation_m=np.where(holes & ~wide, filled, ground.elevation_m))
 

@@ -28,6 +28,8 @@ ITERATIONS = 300
 START_TOLERANCE, TOLERANCE = 1e-4, 1e-9
 #: Largest relative deviation of an inlier's inverse depth from the plane fit.
 MAX_INVERSE_DEPTH_FRACTION = 0.6
+#: Number of fits of this plane; each excludes the features that deviate from the one before.
+_PLANE_FITS = 3
 
 
 @dataclass(frozen=True)
@@ -169,8 +171,9 @@ def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_resid
     """
     design = np.column_stack([first, np.ones(len(first))])
     mask = has_small_residual & (inverse_depths > 0.0)
-    for _ in range(3):
-        if mask.sum() < 4:
+    for _ in range(_PLANE_FITS):
+        # three features have no deviations from a plane
+        if mask.sum() <= 3:
             return mask
         plane = design @ np.linalg.lstsq(design[mask], inverse_depths[mask], rcond=None)[0]
         deviations = np.abs(inverse_depths - plane)
