@@ -84,6 +84,7 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration) -
     axis = mast.geometry.base_m + np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
     range_m = float(np.linalg.norm(position - axis))
     error = tracked_approach_error_m(
+        # focal length times baseline is one argument, so the other one is 1
         stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
         drift_error_m(range_m, mast.left.focal_lengths[0], DRIFT_PX),
     )
@@ -152,7 +153,8 @@ def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3) -> floa
 def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
     """Fit a plane by least squares; return its centre and the unit normal towards the viewpoint."""
     centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    *_, principal_axes = np.linalg.svd(points - centre, full_matrices=False)
+    normal = principal_axes[-1]  # of least variance
     return centre, normal if normal @ (viewpoint - centre) > 0.0 else -normal
 
 

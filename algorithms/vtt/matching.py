@@ -189,7 +189,8 @@ def match_by_lucas_kanade(
 ) -> Match | None:
     """Match the target by its optical flow from the old image, magnified and rolled, to the new image; a `Matcher`.
 
-    The score is the normalised correlation at the match; 0 if the flow does not converge or leaves the image.
+    The score is the normalised correlation at the match. If the flow does not converge or leaves the image, the result
+    is the predicted pixel with the score 0, or None if that pixel is outside of the image.
     """
     window, corner = search_window(image, predicted_pixel, options.search_px)
     if min(window.shape) < options.template_px:
@@ -214,7 +215,7 @@ def match_by_lucas_kanade(
     )
     pixel = np.asarray(tracked_point, dtype=np.float64).reshape(2) + corner
     if not status[0, 0] or not window_fits(image, pixel, options.template_px):
-        return Match(predicted_pixel, 0.0, template)
+        return Match(predicted_pixel, 0.0, template) if window_fits(image, predicted_pixel, 1) else None
     return Match(pixel, correlation(template, extract_patch(image, pixel, options.template_px)), template)
 
 
