@@ -90,6 +90,7 @@ def register_image(
 def flatten(raster: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
     """Return the relative deviation of a raster from the blurred raster: without vignetting, haze and large shadows."""
     blurred = cv2.GaussianBlur(raster, (0, 0), _FLATTEN_PX, borderType=cv2.BORDER_REFLECT)
+    # the lower limit of the divisor is relative to the brightest part; the constant prevents a division of zero by zero
     return np.asarray(raster / np.maximum(blurred, np.float32(1e-6) + np.abs(blurred).max() * np.float32(1e-3)) - 1.0)
 
 
