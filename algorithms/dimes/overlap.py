@@ -20,6 +20,11 @@ from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 MIN_SIGNAL_FRACTION = 0.01
 #: Number of pixels along each side of an image's border that are projected for its outline.
 _BORDER_PIXELS = 8
+#: Points along a side of a square's outline: its corners and the middles of its sides, which distortion bends.
+OUTLINE_POINTS = 3
+#: Points along a side of the lattices over template and search window that must not lie in the zero-phase spot: their
+#: spacing is less than the radius of the spot.
+_TEMPLATE_POINTS, _WINDOW_POINTS = 4, 7
 
 
 @dataclass(frozen=True)
@@ -142,7 +147,7 @@ def template_candidates(
     pixels, ground = pixels[visible], ground[visible]
 
     def fits(view: BinnedView, half_m: float) -> Flags:
-        outline = ground_view.square_outline(half_m, 3)
+        outline = ground_view.square_outline(half_m, OUTLINE_POINTS)
         return np.asarray(
             ground_view.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
         )
@@ -157,9 +162,10 @@ def template_candidates(
         outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
-    valid = is_outside_spot(first, geometry.template_half_m, 4) & is_outside_spot(second, geometry.template_half_m, 4)
+    valid = is_outside_spot(first, geometry.template_half_m, _TEMPLATE_POINTS)
+    valid &= is_outside_spot(second, geometry.template_half_m, _TEMPLATE_POINTS)
     complete = fits(second, geometry.window_half_m)
-    outside = is_outside_spot(second, geometry.window_half_m, 7)
+    outside = is_outside_spot(second, geometry.window_half_m, _WINDOW_POINTS)
     preference = np.sum([fits(second, geometry.template_half_m), complete, complete & outside], axis=0)
     return Candidates(pixels[valid], ground[valid], preference[valid])
 

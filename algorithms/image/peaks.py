@@ -9,8 +9,6 @@ from marsyard.algorithms.arrays import Raster, Vector2
 
 #: Row and column offsets of 3 x 3 pixels from the centre.
 _ROW_OFFSETS, _COLUMN_OFFSETS = np.mgrid[-1.0:2.0, -1.0:2.0]
-
-
 #: Fraction of a peak's height at which its width is measured.
 _WIDTH_LEVEL = 0.75
 
