@@ -113,9 +113,9 @@ def navigate(
     - goal_m: Position (east, north) for the rover's origin, in the estimated world frame
     - step_m: Maximum path length to drive in this step
     """
-    forward = world_from_rover.rotation.as_matrix()[:2, 0]
+    east, north, _ = world_from_rover.rotation.as_matrix()[:, 0]  # the rover's x axis, forward
     position = world_from_rover.translation[:2]
-    world_from_forward = _rotation_matrix(np.arctan2(forward[1], forward[0]))
+    world_from_forward = _rotation_matrix(np.arctan2(north, east))
     goal = np.asarray((goal_m - position) @ world_from_forward)
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, ())

@@ -95,8 +95,8 @@ class RectifiedPair:
         centre, focal = np.array(self.camera.image_centre), self.camera.focal_lengths[0]
         axes = np.stack([self.camera.right, self.camera.down, self.camera.a])
         depth = self.disparity_px_m / disparity_px
+        # derivatives of (right, down, depth) with respect to (u, v of the left pixel, disparity)
         jacobian = np.zeros((len(pixels), 3, 3))
-        # columns: u and v of the left pixel, disparity
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = depth / focal
         slopes = np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))])
         jacobian[:, :, 2] = -slopes * (depth / disparity_px)[:, None]
@@ -175,5 +175,6 @@ def _resample(
     """Resample an image to the rectified camera's directions; 0 outside of the image."""
     directions = rectified.rays(rectified.pixel_grid())[1]
     pixels, visible = camera.project(camera.c + directions)
+    # the pixel (-10, -10) is outside of every image
     maps = np.where(visible[..., None], pixels, -10.0).astype(np.float32)
     return np.asarray(cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC, borderValue=0))

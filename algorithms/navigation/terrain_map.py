@@ -30,7 +30,7 @@ _MIN_MAPPED_FRACTION = 0.8
 class GroundLimits:
     """Limits of the ground that the rover may drive over; those of MER's flight parameters are not published (assumed).
 
-    - radius_m: radius of the disc around the rover's footprint
+    - radius_m: radius of the disc around the rover's footprint, at least a cell
     - climb_m: maximum height above, or depth below, the fitted plane
     - tilt_rad: maximum tilt of the plane
     - roughness_m: maximum standard deviation of the heights from the plane
@@ -46,6 +46,7 @@ class GroundLimits:
 class Goodness:
     """Goodness of the ground at each cell of a map.
 
+    - corner_m: east and north of the centre of cell (0, 0)
     - values: goodness of the disc around the cell, 0 to 1; NaN if less than 80 % of the disc is mapped
     - hazard_m: distance to the nearest cell that is too high or too low
     """
@@ -144,7 +145,7 @@ class TerrainMap:
         def sum_over_disc(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
             return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT))
 
-        # normal equations of z = a + b x + c y over the mapped cells of the disc
+        # normal equations of z = a + b x + c y over the mapped cells of the disc; x and y contain its weights, 0 or 1
         count, sx, sy = sum_over_disc(weight, disc), sum_over_disc(weight, x), sum_over_disc(weight, y)
         sxx, sxy, syy = sum_over_disc(weight, x * x), sum_over_disc(weight, x * y), sum_over_disc(weight, y * y)
         sz, sxz, syz, szz = sum_over_disc(z, disc), sum_over_disc(z, x), sum_over_disc(z, y), sum_over_disc(z * z, disc)
