@@ -396,3 +396,21 @@ def test_folder_of_a_program_that_ended_while_idle_is_removed(tmp_path: Path) ->
     assert server is not ended
     assert not ended.child.folder.exists()
     server.child.stop()
+
+
+#: A program that ends with status 3 at the request `estimate`.
+ENDING_PROGRAM = """
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
+input()
+sys.exit(3)
+"""
+
+
+def test_session_reports_that_its_program_has_ended(measurements: DescentMeasurements, tmp_path: Path) -> None:
+    command = parse_command(f"serve:{write_program(tmp_path, ENDING_PROGRAM)}")
+    assert command is not None
+    estimator = ExecutableAlgorithm(command, ExecutableLimits(), VELOCITY_REQUESTS)
+    for message in ("it ended with status 3", "its process ended after an earlier fault"):
+        with pytest.raises(AlgorithmError, match=message) as error:
+            estimator.estimate(measurements)
+        assert error.value.fault is Fault.CRASHED
