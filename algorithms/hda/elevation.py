@@ -8,6 +8,11 @@ from jaxtyping import Float, Num
 
 from marsyard.algorithms.arrays import Mask, Points2, Points3, Raster, Vector, Vector2
 
+#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
+MIN_WEIGHT = 0.1
+#: Minimum side of a cell, as a fraction of the points' extent: the points of smaller cells lie on a line.
+_MIN_CELL_FRACTION = 1e-6
+
 
 def grassfire(mask: Mask) -> Raster:
     """Grassfire transform (Blum 1973): distance of every cell to the nearest true cell of a mask, in cells.
@@ -23,10 +28,6 @@ def grassfire(mask: Mask) -> Raster:
 def dilate(mask: Mask, radius_cells: float) -> Mask:
     """Dilate a mask by a disc: a cell becomes true within `radius_cells` of a true cell."""
     return np.asarray(mask | (grassfire(mask) <= radius_cells))
-
-
-#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
-MIN_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     extent = high - low
     cell = float(np.sqrt(extent[0] * extent[1] / len(points)))
-    if not cell > 1e-6 * float(extent.max()):
+    if not cell > _MIN_CELL_FRACTION * float(extent.max()):
         return None
     columns, rows = (int(count) for count in np.ceil(extent / cell))
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])

@@ -66,13 +66,9 @@ class NavigationOptions:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if (
-                name in ("half_width_m", "climb_m", "tilt_deg", "roughness_m", "lookahead_m", "max_curvature_per_m")
-                and not 0.0 < value < np.inf
-            ):
-                raise ValueError(f"{name} is {value}; it must be positive")
-            if not 0.0 <= value < np.inf:
-                raise ValueError(f"{name} is {value}; it must not be negative")
+            can_be_zero = name in ("margin_m", "turn_cost_m", "bend_cost_m2")
+            if not (0.0 < value < np.inf or (can_be_zero and value == 0.0)):
+                raise ValueError(f"{name} is {value}; it must {'not be negative' if can_be_zero else 'be positive'}")
 
     @property
     def limits(self) -> GroundLimits:

@@ -26,6 +26,8 @@ from marsyard.sim.measurements import MastImage
 FLOW_LEVELS = 3
 #: Normalisation to the 8-bit images of OpenCV: standard deviation and mean, grey levels.
 SIGMA_GREY, MEAN_GREY = 40.0, 128.0
+#: Registrations after the pure shift, in this order, for each option `warp` except ``none``.
+_WARPS_BY_OPTION: dict[str, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,6 @@ class Match:
     template: Patch
 
 
-#: Registrations after the pure shift, in this order, for each option `warp`.
-_WARPS_BY_OPTION: dict[str, tuple[Warp, ...]] = {
-    "none": (),
-    "shift": (),
-    "stretch": ("stretch",),
-    "bend": ("stretch", "bend"),
-}
 #: Function that matches the target in a new image near a full-frame pixel; None if the window does not fit.
 Matcher = Callable[[Sighting, MastImage, Vector2, ViewChange, VttOptions], Match | None]
 
