@@ -142,32 +142,39 @@ def template_candidates(
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = ground_view.ground_from_pixels(first, pixels, limit)
-    width_m = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options)
-    visible &= width_m >= geometry.max_displacement_m
-    pixels, ground = pixels[visible], ground[visible]
-
-    def fits(view: BinnedView, half_m: float) -> Flags:
-        outline = ground_view.square_outline(half_m, OUTLINE_POINTS)
-        return np.asarray(
-            ground_view.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
-        )
-
+    is_wide = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options) >= geometry.max_displacement_m
+    feasible = visible & is_wide
+    pixels, ground = pixels[feasible], ground[feasible]
     feasible = ground_view.inside_frame(second, ground, 0.0, limit)
     pixels, ground = pixels[feasible], ground[feasible]
-    feasible = fits(first, geometry.template_half_m)
+    template_half_m, window_half_m = geometry.template_half_m, geometry.window_half_m
+    feasible = _fit_into_view(first, ground, template_half_m, options)
     pixels, ground = pixels[feasible], ground[feasible]
+    is_valid = np.ones(len(ground), dtype=bool)
+    for view in (first, second):
+        is_valid &= _are_outside_spot(view, ground, template_half_m, _TEMPLATE_POINTS, sun_direction, options)
+    is_inside = _fit_into_view(second, ground, template_half_m, options)
+    is_complete = _fit_into_view(second, ground, window_half_m, options)
+    is_outside = _are_outside_spot(second, ground, window_half_m, _WINDOW_POINTS, sun_direction, options)
+    preference = np.sum([is_inside, is_complete, is_complete & is_outside], axis=0)
+    return Candidates(pixels[is_valid], ground[is_valid], preference[is_valid])
 
-    def is_outside_spot(view: BinnedView, half_m: float, per_side: int) -> Flags:
-        points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
-        outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
-        return np.asarray(outside.all(axis=1))
 
-    valid = is_outside_spot(first, geometry.template_half_m, _TEMPLATE_POINTS)
-    valid &= is_outside_spot(second, geometry.template_half_m, _TEMPLATE_POINTS)
-    complete = fits(second, geometry.window_half_m)
-    outside = is_outside_spot(second, geometry.window_half_m, _WINDOW_POINTS)
-    preference = np.sum([fits(second, geometry.template_half_m), complete, complete & outside], axis=0)
-    return Candidates(pixels[valid], ground[valid], preference[valid])
+def _fit_into_view(view: BinnedView, ground: Points2, half_m: float, options: DimesOptions) -> Flags:
+    """Whether squares of half side `half_m` around ground points lie in a view."""
+    outlines = ground[:, None] + ground_view.square_outline(half_m, OUTLINE_POINTS)
+    return np.asarray(
+        ground_view.inside_frame(view, outlines, options.border_px, options.max_off_nadir_rad).all(axis=1)
+    )
+
+
+def _are_outside_spot(
+    view: BinnedView, ground: Points2, half_m: float, per_side: int, sun_direction: Vector3, options: DimesOptions
+) -> Flags:
+    """Whether squares around ground points are outside of the zero-phase spot, by lattices of `per_side` points."""
+    points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
+    outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
+    return np.asarray(outside.all(axis=1))
 
 
 def searchable_positions(
