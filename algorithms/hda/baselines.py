@@ -39,6 +39,8 @@ DISPARITY_UNIT = 1.0 / 16.0
 MAX_BASELINE_COSINE = 0.8
 #: Largest side of a rectified image, in diagonals of the original images.
 MAX_SIDE_DIAGONALS = 2.0
+#: Quantile of the counts that becomes white in 8-bit images; few pixels are brighter.
+WHITE_QUANTILE = 0.995
 
 
 @final
@@ -144,7 +146,7 @@ def match_disparities(
 ) -> Float[np.ndarray, "rows columns"]:
     """Compute disparities (pixels) in the first rectified image by semi-global matching; NaN without a match."""
     first_from_rectified = rectification.rectified_from_first.inv()
-    full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
+    full_scale = max(float(np.quantile(views[0].counts, WHITE_QUANTILE)), 1.0)
     rotations = (first_from_rectified, second_from_first.rotation * first_from_rectified)
     rays = rectification.camera.rays(rectification.camera.pixel_grid())[1].reshape(-1, 3)
     images = []

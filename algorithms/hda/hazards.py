@@ -67,9 +67,8 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Raster, R
     starts = [_square_starts(extent, side) for extent in shape]
     # random numbers from which the kernel selects three cells in each trial
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
-    planes = kernels.footprint_planes(
-        ground.elevation_m, starts[0], starts[1], side, max(side * side // 2, 4), triples, options.refine_planes
-    )
+    min_cells = max(side * side // 2, 4)  # a plane through three cells has no residuals
+    planes = kernels.footprint_planes(ground.elevation_m, *starts, side, min_cells, triples, options.refine_planes)
     if planes.size == 0:
         return np.full(shape, np.nan), np.full(shape, np.nan)
     heights, column_slopes, row_slopes = np.moveaxis(planes, -1, 0)

@@ -29,6 +29,8 @@ CONTACT_M, TOOLS_M, CLEARANCE_M = 0.02, 0.05, 0.015
 MAX_RESELECTION_M = 0.008
 #: Spacing of the positions that are checked, metres.
 _SPACING_M = 0.002
+#: Tolerance of distances on this grid, so that rounding errors do not exclude its last positions, metres.
+_ROUNDING_M = 1e-9
 #: Minimum number of surface points on the contact disc.
 _MIN_POINTS = 20
 #: Depths of surface points, divided by the target's depth.
@@ -188,9 +190,9 @@ def _offsets(normal: Vector3, radius_m: float) -> Points3:
     """Create the offsets of a square grid within a radius, perpendicular to a normal, from near to far."""
     first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     first /= np.linalg.norm(first)
-    count = int(radius_m / _SPACING_M + 1e-9)
+    count = int((radius_m + _ROUNDING_M) / _SPACING_M)
     steps = _SPACING_M * np.arange(-count, count + 1)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     radii = np.hypot(*grid.T)
-    grid = grid[np.argsort(radii, kind="stable")][: int(np.count_nonzero(radii <= radius_m + 1e-9))]
+    grid = grid[np.argsort(radii, kind="stable")][: int(np.count_nonzero(radii <= radius_m + _ROUNDING_M))]
     return np.asarray(grid @ np.stack([first, np.cross(normal, first)]))

@@ -19,6 +19,8 @@ from marsyard.sim.measurements import MastImage
 
 #: Inverse of the largest searched range, 1/m; at 1000 km the disparity is below a hundredth of a pixel.
 _MIN_INVERSE_RANGE = 1e-6
+#: Squared sine of the angle between two lines of sight above which they are not parallel; above its rounding errors.
+_MIN_SQUARED_SINE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,8 @@ def nearest_point(left: LineOfSight, right: LineOfSight) -> Vector3 | None:
     """
     (left_origin, left_ray), (right_origin, right_ray) = left, right
     offset, cosine = right_origin - left_origin, float(left_ray @ right_ray)
-    determinant = 1.0 - cosine * cosine
-    if not determinant > 1e-14:
+    determinant = 1.0 - cosine * cosine  # squared sine of the angle between the lines
+    if not determinant > _MIN_SQUARED_SINE:
         return None
     left_range_m = float(offset @ (left_ray - cosine * right_ray)) / determinant
     right_range_m = float(offset @ (cosine * left_ray - right_ray)) / determinant
