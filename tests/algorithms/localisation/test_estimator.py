@@ -5,6 +5,7 @@ The matching stages are replaced by functions with given results (`Stages`), or 
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -258,8 +259,9 @@ def test_measurements_outside_of_the_inertial_data_are_not_used(
 
 @pytest.mark.parametrize("name", ["coarse_images", "coarse_altitudes", "acquisition_landmarks"])
 def test_numbers_of_images_altitudes_and_landmarks_are_positive(name: str) -> None:
+    options: dict[str, Any] = {name: 0}
     with pytest.raises(ValueError, match=f"{name} is 0; it must be at least 1"):
-        LvsOptions(**{name: 0})
+        LvsOptions(**options)
 
 
 @pytest.mark.parametrize("make_estimator", [MapRelativeEstimator, InertialEstimator, FeatureEstimator])
