@@ -148,19 +148,19 @@ def template_candidates(
     feasible = ground_view.inside_frame(second, ground, 0.0, limit)
     pixels, ground = pixels[feasible], ground[feasible]
     template_half_m, window_half_m = geometry.template_half_m, geometry.window_half_m
-    feasible = _fit_into_view(first, ground, template_half_m, options)
+    feasible = _lie_in_view(first, ground, template_half_m, options)
     pixels, ground = pixels[feasible], ground[feasible]
     is_valid = np.ones(len(ground), dtype=bool)
     for view in (first, second):
         is_valid &= _are_outside_spot(view, ground, template_half_m, _TEMPLATE_POINTS, sun_direction, options)
-    is_inside = _fit_into_view(second, ground, template_half_m, options)
-    is_complete = _fit_into_view(second, ground, window_half_m, options)
+    is_inside = _lie_in_view(second, ground, template_half_m, options)
+    is_complete = _lie_in_view(second, ground, window_half_m, options)
     is_outside = _are_outside_spot(second, ground, window_half_m, _WINDOW_POINTS, sun_direction, options)
     preference = np.sum([is_inside, is_complete, is_complete & is_outside], axis=0)
     return Candidates(pixels[is_valid], ground[is_valid], preference[is_valid])
 
 
-def _fit_into_view(view: BinnedView, ground: Points2, half_m: float, options: DimesOptions) -> Flags:
+def _lie_in_view(view: BinnedView, ground: Points2, half_m: float, options: DimesOptions) -> Flags:
     """Whether squares of half side `half_m` around ground points lie in a view."""
     outlines = ground[:, None] + ground_view.square_outline(half_m, OUTLINE_POINTS)
     return np.asarray(

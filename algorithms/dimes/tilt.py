@@ -194,6 +194,7 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
 
         return np.asarray(optimize.least_squares(residuals, start, x_scale=scale, method="lm").x)
 
+    # start with level ground, the initial velocities, and no corrections
     no_inclination, _, *no_corrections = (np.zeros(size) for size in _PART_SIZES)
     displacements_m = [velocity * pair.interval_s for velocity, pair in zip(velocities_m_s, pairs, strict=True)]
     state = np.concatenate([no_inclination, *displacements_m, *no_corrections])
