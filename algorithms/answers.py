@@ -46,6 +46,17 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, (), attitude_error)
 
 
+def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """Validate an estimate; a missing time span becomes the last image interval.
+
+    Raises the same error as `check_velocity`.
+    """
+    estimate = check_velocity(answer, tags_s)
+    if estimate.span_s is not None or len(tags_s) < 2:
+        return estimate
+    return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
+
+
 def _check_span(answer_span: Any, tags_s: Sequence[float] | None) -> tuple[float, float]:
     """Validate an averaging interval; it must lie within the images' time tags, if these are known."""
     is_pair = isinstance(answer_span, tuple) and len(answer_span) == 2
@@ -146,14 +157,3 @@ def check_type(name: str, value: Any, kind: type) -> None:
 
 def _type_name(value: object) -> str:
     return type(value).__name__
-
-
-def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate an estimate; a missing time span becomes the last image interval.
-
-    Raises the same error as `check_velocity`.
-    """
-    estimate = check_velocity(answer, tags_s)
-    if estimate.span_s is not None or len(tags_s) < 2:
-        return estimate
-    return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
