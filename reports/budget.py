@@ -39,16 +39,15 @@ def budget_sentences(record: Mapping[str, Any]) -> list[str]:
     sentences: list[str] = []
     budget = result.budget
     if budget is not None:
+        largest_contributions = [item for item in budget.contributions[:3] if item.mean > 0.0]
         largest = ", ".join(
-            f"{item.title} {signed_percent(item.mean / budget.total)}"
-            for item in budget.contributions[:3]
-            if item.mean > 0
+            f"{item.title} {signed_percent(item.mean / budget.total)}" for item in largest_contributions
         )
         sentences += [
             f"{parameters.requirement}: {_statistic(result)} of {label(result.quantity)}: "
             f"{number(math.sqrt(budget.total))} with all sources of error, {_format_root(budget.remaining)} without "
             f"any, from the {budget.common} of {count(result.cases, 'base case')} that were answered in every variant.",
-            f"Largest contributions to the mean square: {largest}; "
+            f"Largest contributions to the mean square: {largest or 'none'}; "
             f"{REMAINING} {signed_percent(budget.remaining / budget.total)}.",
             _closure_sentence(budget, parameters.confidence),
         ]

@@ -3,10 +3,9 @@
 A condition is a column such as the sun elevation; a bin is one of its values, or an interval of values.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,13 +23,26 @@ from marsyard.reports.wording import format_fraction, label, note_text, number, 
 from marsyard.scenarios.columns import split_unit
 
 
-def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
-    """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
+@dataclass(frozen=True)
+class TerrainVariance:
+    """Variance of an error column (`part`) with terrains as random effects.
 
-    Keys: `part` (the column), `terrains` (their number), `within_sd` of errors within a terrain, `between_sd` of the
-    terrains' means, `fraction` of the variance between terrains (intraclass correlation), `p_value` of equal means
-    (F-test).
+    - terrains: number of terrains
+    - within_sd, between_sd: standard deviations of errors within a terrain, and of the terrains' means
+    - fraction: fraction of the variance between terrains (intraclass correlation)
+    - p_value: p-value of equal means (F-test); NaN without a variance within terrains
     """
+
+    part: str
+    terrains: int
+    within_sd: float
+    between_sd: float
+    fraction: float
+    p_value: float
+
+
+def terrain_variance(frame: pd.DataFrame, column: str) -> TerrainVariance | None:
+    """Analyse the variance of an error column with terrains as random effects; None without repeated terrains."""
     groups = rates.terrain_groups(frame)
     values = numbers(frame, column)
     finite = np.isfinite(values) & populations.population_mask(frame, "valid")
@@ -43,14 +55,15 @@ def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
     within, between, effective_size = mean_squares(values[finite], index)
     variance_between = max(between - within, 0.0) / effective_size
     p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
-    return {
-        "part": column,
-        "terrains": terrains,
-        "within_sd": float(np.sqrt(within)),
-        "between_sd": float(np.sqrt(variance_between)),
-        "fraction": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
-        "p_value": p_value,
-    }
+    variance = variance_between + within
+    return TerrainVariance(
+        part=column,
+        terrains=terrains,
+        within_sd=float(np.sqrt(within)),
+        between_sd=float(np.sqrt(variance_between)),
+        fraction=variance_between / variance if variance > 0.0 else 0.0,
+        p_value=p_value,
+    )
 
 
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
@@ -95,15 +108,12 @@ def conditions_section(subject: Subject) -> Section | None:
         head = ["", "Terrains", "SD within terrains", "SD between terrains", "Fraction between terrains", "p"]
         rows = []
         for row in terrain_rows:
-            deviations = [number(row["within_sd"]), number(row["between_sd"])]
-            texts = [label(row["part"]), f"{row['terrains']:,}", *deviations, percent(row["fraction"])]
-            rows.append([*texts, number(row["p_value"])])
+            deviations = [number(row.within_sd), number(row.between_sd)]
+            texts = [label(row.part), f"{row.terrains:,}", *deviations, percent(row.fraction)]
+            rows.append([*texts, number(row.p_value)])
         blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_TERRAINS_NOTE))
     note = note_text("common.conditions", confidence=format_fraction(CONFIDENCE), quantile=format_fraction(QUANTILE))
-    data: dict[str, Any] = {
-        column: [row | {"answered": asdict(row["answered"])} for row in bins] for column, bins in tables.items()
-    }
-    data["between_terrains"] = terrain_rows
+    data = {**tables, "between_terrains": terrain_rows}
     title = "Errors and answers by condition"
     return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
 
@@ -140,8 +150,26 @@ def _bin_by_interval(values: Float[np.ndarray, " n"]) -> list[NamedMask]:
     return [(name, bin_numbers == index) for index, name in enumerate(names)]
 
 
-def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
-    """Summarize a bin: answers, mean and SD of the signed errors, upper confidence bound of the 99 % quantile."""
+@dataclass(frozen=True)
+class BinSummary:
+    """Answers and errors of the cases in a bin.
+
+    - answered: fraction of answered cases
+    - means, sds: mean and standard deviation of the signed errors, by component; NaN for too few answers
+    - quantile_bound: upper confidence bound of the quantile `QUANTILE` of the magnitude; infinite for too few answers
+    - largest: largest magnitude; NaN without an answer
+    """
+
+    name: str
+    answered: rates.CaseFraction
+    means: Sequence[float]
+    sds: Sequence[float]
+    quantile_bound: float
+    largest: float
+
+
+def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> BinSummary:
+    """Summarize the rows of a bin with this name."""
     is_answered = populations.population_mask(rows, "valid")
     answered_rows = rows[is_answered]
     magnitude, groups = np.abs(numbers(answered_rows, metric)), rates.terrain_groups(answered_rows)
@@ -149,18 +177,18 @@ def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]
     magnitude, finite_groups = magnitude[finite], None if groups is None else groups[finite]
     components = [rates.finite_values(answered_rows, column) for column in _signed_components(rows, metric)]
     _, quantile_bound = quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)
-    return {
-        "name": name,
-        "answered": rates.fraction_of(is_answered, rows),
-        "means": [float(component.mean()) if component.size else float("nan") for component in components],
-        "sds": [float(component.std(ddof=1)) if component.size > 1 else float("nan") for component in components],
-        "quantile_bound": quantile_bound,
-        "largest": float(magnitude.max()) if magnitude.size else float("nan"),
-    }
+    return BinSummary(
+        name=name,
+        answered=rates.fraction_of(is_answered, rows),
+        means=[float(component.mean()) if component.size else float("nan") for component in components],
+        sds=[float(component.std(ddof=1)) if component.size > 1 else float("nan") for component in components],
+        quantile_bound=quantile_bound,
+        largest=float(magnitude.max()) if magnitude.size else float("nan"),
+    )
 
 
-def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
-    """Create the table of a condition: a row for each of its bins, as `_summarize_bin` summarizes them."""
+def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[BinSummary]) -> Grid:
+    """Create the table of a condition: a row for each of its bins."""
     columns = _signed_components(frame, metric)
     axes = (
         [""]
@@ -170,19 +198,17 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
     head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]
-    has_bounds = any(np.isfinite(row["quantile_bound"]) for row in bins)
+    has_bounds = any(np.isfinite(row.quantile_bound) for row in bins)
     head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})"] if has_bounds else []
     head += [f"Maximum ({unit})"]
     rows = []
     for row in bins:
-        component_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]
-        answered, bound = row["answered"], row["quantile_bound"]
+        component_texts = [number(value) for pair in zip(row.means, row.sds, strict=True) for value in pair]
+        answered, bound = row.answered, row.quantile_bound
         last_texts = [number(bound) if np.isfinite(bound) else "too few cases"] if has_bounds else []
-        last_texts.append(number(row["largest"]))
+        last_texts.append(number(row.largest))
         interval = rates.range_text(*answered.clustered_interval)
-        rows.append(
-            [row["name"], f"{answered.n:,}", percent(answered.fraction), interval, *component_texts, *last_texts]
-        )
+        rows.append([row.name, f"{answered.n:,}", percent(answered.fraction), interval, *component_texts, *last_texts])
     return Grid(head, rows)
 
 

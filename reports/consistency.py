@@ -3,7 +3,7 @@
 The normalised estimation error squared (NEES) of an estimate is its error, weighted by the inverse of its covariance.
 """
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -23,24 +23,38 @@ NEES, NEES_DIMENSION = ("velocity_nees", "position_nees"), 2
 BAND_PROBABILITY = 0.95
 
 
-def evaluate_consistency(nees: Float[np.ndarray, " n"]) -> dict[str, Any]:
-    """Evaluate from the NEES of estimates whether their errors agree with their covariances.
+@dataclass(frozen=True)
+class Consistency:
+    """Agreement of the errors of estimates with their covariances.
 
-    Keys: mean NEES with its band for correct covariances, fraction of errors `inside` their ellipse with its 90 %
-    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
+    - n, mean: number of estimates, and mean of their NEES
+    - lower, upper: band of the mean for correct covariances
+    - inside, inside_lower, inside_upper: fraction of errors inside their ellipse, and its interval
+    - word: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic"
     """
+
+    n: int
+    mean: float
+    lower: float
+    upper: float
+    inside: float
+    inside_lower: float
+    inside_upper: float
+    word: str
+
+
+def evaluate_consistency(nees: Float[np.ndarray, " n"]) -> Consistency:
+    """Evaluate from the NEES of at least one estimate whether the errors agree with their covariances."""
     n, mean = nees.size, float(nees.mean())
     tail = 0.5 * (1.0 - BAND_PROBABILITY)
     # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
     lower, upper = (float(stats.chi2.ppf(level, NEES_DIMENSION * n)) / n for level in (tail, 1.0 - tail))
-    inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, NEES_DIMENSION)).sum())
-    low, high = proportion_interval(inside, n, CONFIDENCE)
+    n_inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, NEES_DIMENSION)).sum())
     word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
-    band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
-    return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": word}
+    return Consistency(n, mean, lower, upper, n_inside / n, *proportion_interval(n_inside, n, CONFIDENCE), word)
 
 
-def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
+def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, Consistency]:
     """Evaluate the consistency of all algorithms with covariances in the rows, by name."""
     tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
     frames = {tested_name: frame, **{name: select_algorithm(frame, name) for name in list_compared_algorithms(frame)}}
@@ -55,9 +69,9 @@ def consistency_section(subject: Subject) -> Section | None:
         return None
     rows = []
     for name, result in results.items():
-        inside = f"{percent(result['inside'])} ({rates.range_text(result['inside_lower'], result['inside_upper'])})"
-        band = f"{number(result['lower'])} to {number(result['upper'])}"
-        rows.append([name, f"{result['n']:,}", number(result["mean"]), band, inside, result["word"]])
+        inside = f"{percent(result.inside)} ({rates.range_text(result.inside_lower, result.inside_upper)})"
+        band = f"{number(result.lower)} to {number(result.upper)}"
+        rows.append([name, f"{result.n:,}", number(result.mean), band, inside, result.word])
     band_text = format_fraction(BAND_PROBABILITY)
     head = [
         "Algorithm",

@@ -4,6 +4,7 @@ A step is the motion of the rover from one image to the next: an angle, or a fra
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -37,30 +38,30 @@ def steps_section(subject: Subject) -> Section | None:
     lines = [
         RateLine(
             name,
-            [cell["step"] for cell in line_cells],
-            [cell["good"] for cell in line_cells],
-            {cell["step"]: cell["paper_percent"] / 100.0 for cell in line_cells if cell["paper_percent"] is not None},
+            [cell.step for cell in line_cells],
+            [cell.good for cell in line_cells],
+            {cell.step: cell.paper_percent / 100.0 for cell in line_cells if cell.paper_percent is not None},
         )
-        for name in dict.fromkeys(cell["line"] for cell in steps)
-        if (line_cells := [cell for cell in steps if cell["line"] == name and cell["good"].n])
+        for name in dict.fromkeys(cell.line for cell in steps)
+        if (line_cells := [cell for cell in steps if cell.line == name and cell.good.n])
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
     caption = f"Selectable targets that are tracked to the end, with {format_fraction(CONFIDENCE)} intervals."
-    columns: dict[str, Callable[[dict[str, Any]], str]] = {
-        f"Step ({unit})": lambda cell: number(cell["step"]).rstrip("0").rstrip("."),
-        "Tracked, of selectable": lambda cell: rates.fraction_text(cell["good"]),
-        f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell["good"]),
-        "Tracked, of all targets": lambda cell: rates.fraction_text(cell["all_targets"]),
-        "False track, of selectable": lambda cell: rates.fraction_text(cell["false_tracks"]),
+    columns: dict[str, Callable[[StepRates], str]] = {
+        f"Step ({unit})": lambda cell: number(cell.step).rstrip("0").rstrip("."),
+        "Tracked, of selectable": lambda cell: rates.fraction_text(cell.good),
+        f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell.good),
+        "Tracked, of all targets": lambda cell: rates.fraction_text(cell.all_targets),
+        "False track, of selectable": lambda cell: rates.fraction_text(cell.false_tracks),
     }
-    if any(cell["line"] for cell in steps):
-        name = "Search window" if str(steps[0]["line"]).endswith("px") else "Tracker"
-        columns = {name: lambda cell: cell["line"], **columns}
+    if any(cell.line for cell in steps):
+        name = "Search window" if steps[0].line.endswith("px") else "Tracker"
+        columns = {name: lambda cell: cell.line, **columns}
     if any(line.paper for line in lines):
         caption += " Open marks: text of the paper."
         columns["Paper, of selectable"] = lambda cell: (
-            NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']:.0f} %"
+            NOTHING if cell.paper_percent is None else f"{cell.paper_percent:.0f} %"
         )
     grid = build_grid(steps, columns)
     svg_figures = [svg_figure(rate_figure(lines, (xlabel, "targets tracked")), "steps", caption)]
@@ -78,13 +79,26 @@ def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
     return motions.get(str(drive_legs[0].get("motion", "approach"))) if len(drive_legs) == 1 else None
 
 
-def step_rates(subject: Subject) -> list[dict[str, Any]]:
-    """Compute the rates of tracked targets for every line (tracker or search window) and step size.
+@dataclass(frozen=True)
+class StepRates:
+    """Rates of tracked targets of a line (tracker or search window; empty for a single one) at a step size.
 
     - step: angle in degrees, or fraction of the distance to the target in per cent
     - good, false_tracks: fractions of the selectable targets that are tracked, and that have a false track
     - all_targets: fraction of all targets that are tracked
+    - paper_percent: percentage of tracked targets in the paper; None without one
     """
+
+    line: str
+    step: float
+    good: rates.CaseFraction
+    all_targets: rates.CaseFraction
+    false_tracks: rates.CaseFraction
+    paper_percent: float | None
+
+
+def step_rates(subject: Subject) -> list[StepRates]:
+    """Compute the rates of tracked targets for every line and step size."""
     frame, motion = subject.frame, _read_motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame:
         return []
@@ -98,14 +112,14 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                 percentage for size, percentage in paper.items() if abs(step - float(size)) < _MAX_STEP_DIFFERENCE
             )
             cells.append(
-                {
-                    "line": line,
-                    "step": step,
-                    "good": rates.flag_fraction(selectable_rows, "tracked"),
-                    "all_targets": rates.flag_fraction(step_rows, "tracked"),
-                    "false_tracks": rates.flag_fraction(selectable_rows, "no_false_track", value=False),
-                    "paper_percent": next(paper_percentages, None),
-                }
+                StepRates(
+                    line=line,
+                    step=step,
+                    good=rates.flag_fraction(selectable_rows, "tracked"),
+                    all_targets=rates.flag_fraction(step_rows, "tracked"),
+                    false_tracks=rates.flag_fraction(selectable_rows, "no_false_track", value=False),
+                    paper_percent=next(paper_percentages, None),
+                )
             )
     return cells
 

@@ -3,8 +3,8 @@
 Equations and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -81,10 +81,25 @@ def table_1_section(subject: Subject) -> Section | None:
     )
 
 
-def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
+@dataclass(frozen=True)
+class MeasuredAccuracy:
+    """3-sigma errors (three times the root mean square) of the completed runs of a camera, centimetres.
 
-    untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose
+    - designation_cm, tracked_cm: errors at the designation, and at the goal with tracking
+    - untracked_cm: error at the goal without tracking, computed by Eq. 3 from the errors of designation and pose
+    - drift_px: root mean square of the drift, pixels
+    """
+
+    camera: str
+    runs: int
+    designation_cm: float
+    untracked_cm: float
+    tracked_cm: float
+    drift_px: float
+
+
+def measured_accuracy(frame: pd.DataFrame) -> list[MeasuredAccuracy]:
+    """Compute the errors of the completed runs of each camera with the distances of Table I.
 
     The disparity error cannot be computed from the designation error by Eq. 1, because most of the designation error
     is caused by the mast and lies across the line of sight.
@@ -100,19 +115,19 @@ def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
         runs = completed_runs[completed_runs["camera"].eq(camera)]
         designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
         rows.append(
-            {
-                "camera": str(camera),
-                "runs": len(runs),
-                "designation_cm": _THREE_SIGMA_CM * rates.rms(designation),
-                "untracked_cm": _THREE_SIGMA_CM * rates.rms(np.hypot(designation, pose)),
-                "tracked_cm": _THREE_SIGMA_CM * rates.rms(numbers(runs, "position_error_m")),
-                "drift_px": rates.rms(numbers(runs, "drift_px")),
-            }
+            MeasuredAccuracy(
+                camera=str(camera),
+                runs=len(runs),
+                designation_cm=_THREE_SIGMA_CM * rates.rms(designation),
+                untracked_cm=_THREE_SIGMA_CM * rates.rms(np.hypot(designation, pose)),
+                tracked_cm=_THREE_SIGMA_CM * rates.rms(numbers(runs, "position_error_m")),
+                drift_px=rates.rms(numbers(runs, "drift_px")),
+            )
         )
     return rows
 
 
-def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
+def _measured_grid(accuracy: Sequence[MeasuredAccuracy]) -> Grid:
     """Create the table of measured errors, each next to that of the paper for the camera."""
     quantities = ("Designation", "Without tracking", "With tracking")
     pairs = [(f"{name} (cm)", f"Paper: {name.lower()} (cm)") for name in quantities[:2]]
@@ -120,14 +135,14 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
     rows = []
     for row in accuracy:
         printed_row = next(
-            (row_of_paper for name, row_of_paper in PRINTED.items() if row["camera"].endswith(name.lower())), None
+            (row_of_paper for name, row_of_paper in PRINTED.items() if row.camera.endswith(name.lower())), None
         )
         paper = [NOTHING] * 3
         if printed_row is not None:
             # the formula holds in any unit of length
-            paper_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
+            paper_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row.drift_px)
             paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{paper_cm:.1f}"]
-        measured = [f"{row[name]:.1f}" for name in ("designation_cm", "untracked_cm", "tracked_cm")]
+        measured = [f"{value:.1f}" for value in (row.designation_cm, row.untracked_cm, row.tracked_cm)]
         texts = [text for pair in zip(measured, paper, strict=True) for text in pair]
-        rows.append([row["camera"], f"{row['runs']:,}", *texts, f"{row['drift_px']:.1f}"])
+        rows.append([row.camera, f"{row.runs:,}", *texts, f"{row.drift_px:.1f}"])
     return Grid(["Camera", "Runs", *(heading for pair in pairs for heading in pair), "Drift, rms (px)"], rows)

@@ -62,21 +62,21 @@ def test_columns_of_a_compared_algorithm_are_selected() -> None:
 
 def test_correct_covariances_are_consistent_at_95_percent() -> None:
     rng = np.random.default_rng(7)
-    verdicts = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
+    verdicts = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng)).word for _ in range(400)]
     # 0.95, minus 4 and plus 3 standard deviations of 1.1 %
     assert 0.91 <= verdicts.count("consistent") / 400 <= 0.985
     overconfident = evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
-    assert overconfident["word"] == "optimistic"
-    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "pessimistic"
+    assert overconfident.word == "optimistic"
+    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0).word == "pessimistic"
 
 
 @pytest.mark.parametrize("column", ["velocity_nees", "position_nees"])
 def test_consistency_covers_all_algorithms_with_covariances(column: str) -> None:
     frame = make_paired_rows([1, 2, 3], [3, 4, 5]).assign(**{f"other.{column}": [2.0, 2.0, np.nan]})
     ((name, values),) = evaluate_consistencies(frame).items()
-    assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")
+    assert (name, values.n, values.mean, values.word) == ("other", 2, 2.0, "consistent")
     # the sum of two values with two degrees of freedom each
-    assert values["lower"] == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
+    assert values.lower == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
 
 
 def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
