@@ -35,6 +35,7 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
     n, failures = int(member.sum()), int((member & ~success).sum())
     first_n = n if looks.in_first_look is None else int((member & looks.in_first_look).sum())
     risk = 1.0 - verdict.confidence
+    # PASS shows that failures are rare enough, FAIL that successes are
     pass_test, fail_test = (
         SequentialTest(rate, risk, first_n) for rate in (1.0 - verdict.probability, verdict.probability)
     )

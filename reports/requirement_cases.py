@@ -151,8 +151,9 @@ class CaseFinder:
         is_violation = np.zeros(len(self._frame), dtype=np.bool_)
         for item in self._evaluated:
             is_violation |= item.margins < 0.0
-        #: Numbers of the cases that violate any requirement, in increasing order.
-        self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if is_violation.any() else []
+        has_numbers = "case" in self._frame
+        #: Numbers of the cases that violate any requirement, in increasing order; empty for rows without numbers.
+        self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if has_numbers else []
 
     def requirement_cases(self) -> list[RequirementCases]:
         """List the cases of each requirement."""
@@ -173,9 +174,12 @@ class CaseFinder:
         return [item.verdict.requirement_id for item in self._evaluated]
 
     def violations(self, requirement_id: str) -> list[int]:
-        """Return the numbers of the cases that violate a requirement, the smallest margin first."""
+        """Return the numbers of the cases that violate a requirement, the smallest margin first.
+
+        Empty for rows without numbers.
+        """
         rows = [item.violations for item in self._evaluated if item.verdict.requirement_id == requirement_id]
-        return [] if not rows else self._frame["case"].iloc[rows[0]].tolist()
+        return self._frame["case"].iloc[rows[0]].tolist() if rows and "case" in self._frame else []
 
     def explored_requirements(self) -> list[ExploredRequirement]:
         """Return the status of all cases by requirement, for the explorer."""
@@ -190,7 +194,9 @@ class CaseFinder:
         ]
 
     def worst_violations(self, max_per_requirement: int) -> list[int]:
-        """Return the worst violations of each requirement, without repetition."""
+        """Return the worst violations of each requirement, without repetition; empty for rows without numbers."""
+        if "case" not in self._frame:
+            return []
         rows = [row for item in self._evaluated for row in item.violations[:max_per_requirement]]
         return list(dict.fromkeys(int(self._frame["case"].iloc[row]) for row in rows))
 

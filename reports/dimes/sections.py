@@ -61,6 +61,14 @@ def ignition_section(subject: Subject) -> Section | None:
     )
 
 
+#: Columns of the horizontal speed at touchdown with and without steering.
+SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
+#: Minimum change of speed that counts as an improvement or a degradation, m/s.
+MIN_SPEED_CHANGE_M_S = 1.0
+#: Speeds above which the table gives the fraction of cases, m/s.
+SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
+
+
 def landing_section(subject: Subject) -> Section | None:
     """Create the section on the horizontal speed at touchdown with and without steering by the estimated velocity."""
     landings = landing_rows(subject)
@@ -89,14 +97,6 @@ def landing_section(subject: Subject) -> Section | None:
         ),
         create_speed_block(landings, subject),
     )
-
-
-#: Columns of the horizontal speed at touchdown with and without steering.
-SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
-#: Minimum change of speed that counts as an improvement or a degradation, m/s.
-MIN_SPEED_CHANGE_M_S = 1.0
-#: Speeds above which the table gives the fraction of cases, m/s.
-SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
