@@ -11,7 +11,7 @@ from marsyard.algorithms.vtt.stereo import triangulate
 from marsyard.scenarios.rover import points
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Triangles, Vector
-from marsyard.scenarios.rover.vehicle import Rig
+from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.frames import SITE_FROM_WORLD

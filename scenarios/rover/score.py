@@ -57,10 +57,11 @@ def update_quantities(run: RoverRun) -> dict[str, Float64[np.ndarray, "stops"]]:
 
 def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
     """Compute the columns of the first updates (as in Table III), NaN for missing updates."""
+    quantities = update_quantities(run)
     return {
         f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else np.nan
         for number in range(count)
-        for name, values in update_quantities(run).items()
+        for name, values in quantities.items()
     }
 
 

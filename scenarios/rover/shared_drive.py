@@ -107,10 +107,12 @@ class SharedDriveParameters(Parameters):
 
     @property
     def step(self) -> float:
-        """Step between two updates: a fraction of the distance, or degrees of a turn or circle."""
+        """Step between two updates: degrees of a turn or circle, fixed length (m), or fraction of the distance."""
         leg = self.drive.legs[0]
         if leg.motion in ("turn", "circle"):
             return abs(leg.step_deg) * (self.skipped_stops + 1)
+        if leg.step_m is not None:
+            return abs(leg.step_m) * (self.skipped_stops + 1)
         return float(1.0 - (1.0 - leg.step_fraction) ** (self.skipped_stops + 1))
 
 
@@ -255,7 +257,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         key, point, algorithm = DriveKey.from_parameters(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
         case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
-        visibility, shadow_columns = self._visibility(key, point, p.drive.vtt)
+        visibility, shadow = self._visibility(key, point, p.drive.vtt)
         shared = {
             **fixed_conditions(case, prepare_shared_run(p, drive)),
             "step": p.step,
@@ -263,7 +265,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "pure_ncc": algorithm == "pure-ncc",
             **{entry.name: bool(entry.min <= p.step <= entry.max) for entry in p.step_ranges},
             **asdict(visibility),
-            **shadow_columns,
+            **shadow,
             "on_face": visibility.in_view
             and (p.max_obliquity_deg is None or visibility.obliquity_max_deg <= p.max_obliquity_deg),
         }

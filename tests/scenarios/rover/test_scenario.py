@@ -168,6 +168,20 @@ def test_unknown_trackers_and_cameras_are_rejected() -> None:
         make_parameters(camera={"preset": "xc-55"})
 
 
+def test_step_of_a_shared_drive_is_that_of_its_leg() -> None:
+    """A leg with a fixed step ignores `step_fraction`; every third stop triples the step."""
+    steps = {
+        "approach": ({"step_fraction": 0.1}, 1.0 - 0.9**3),
+        "straight": ({"step_m": -0.2}, 0.6),
+        "circle": ({"step_deg": -5.0}, 15.0),
+    }
+    for motion, (leg, step) in steps.items():
+        parameters = SharedDriveParameters.model_validate(
+            {"drive": {"legs": [{"motion": motion, **leg}]}, "variants": [{}], "targets": [{}], "skipped_stops": 2}
+        )
+        assert parameters.step == pytest.approx(step)
+
+
 @pytest.mark.slow
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
