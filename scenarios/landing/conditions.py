@@ -14,6 +14,8 @@ from marsyard.sim.sensor import height_above_ground
 #: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
 #: axis, and change of height as a fraction of the range along the optical axis.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
+#: Tolerances of these limits: flights that are exactly at a limit are within it.
+_ANGLE_TOLERANCE_DEG, _FRACTION_TOLERANCE = 0.5, 0.01
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
@@ -38,8 +40,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
-    # the paper's limits of tracking (section II.A); pitch, yaw and roll are the components of the rotation vector about
-    # the x, y and optical axes of the camera
+    # for the limits of tracking: components of the rotation vector about the x, y and optical axes of the camera
     pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
     # height and vertical at the first image; motion and rotation vector, body axes, to the second image
     first, second = case.flight.states
@@ -48,11 +49,10 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
     up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
     rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
-    # the tolerances include flights that are exactly at the limits
     within_limits = (
-        roll < MAX_ROLL_DEG + 0.5
-        and max(pitch, yaw) < MAX_TILT_DEG + 0.5
-        and abs(float(motion[2])) < (MAX_HEIGHT_CHANGE_FRACTION + 0.01) * pair.axis_range_m
+        roll < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
+        and max(pitch, yaw) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
+        and abs(float(motion[2])) < (MAX_HEIGHT_CHANGE_FRACTION + _FRACTION_TOLERANCE) * pair.axis_range_m
     )
     return {
         "site": p.site,
