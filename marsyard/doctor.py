@@ -50,7 +50,19 @@ BYTES_PER_MIB = 2**20
 SUFFICIENT_DISK_MIB, MIN_DISK_MIB = 1024, 100
 #: Memory that one worker process needs, MiB.
 WORKER_MEMORY_MIB = 512
+#: Time limit of a separate process, seconds.
 PROBE_TIMEOUT_S = 30.0
+#: Program that imports the modules in its arguments; it prints name and error message of each module as JSON.
+_IMPORT_SCRIPT = """
+import importlib, json, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+        message = ""
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+    print(json.dumps([name, message]), flush=True)
+"""
 
 
 class CheckResult(Enum):
@@ -198,19 +210,6 @@ def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
         if remaining:  # the first remaining module crashed the process
             failures[remaining.pop(0)] = _failure_reason(process)
     return failures
-
-
-#: Program that imports the modules in its arguments; it prints name and error message of each module as JSON.
-_IMPORT_SCRIPT = """
-import importlib, json, sys
-for name in sys.argv[1:]:
-    try:
-        importlib.import_module(name)
-        message = ""
-    except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-    print(json.dumps([name, message]), flush=True)
-"""
 
 
 def _list_requirements() -> list[Requirement]:

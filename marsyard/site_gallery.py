@@ -86,7 +86,8 @@ class GalleryImage:
 def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path]) -> Path:
     """Render all `VIEWS` and DTM files; write the gallery and return the path of the page.
 
-    Raises ValueError if a file is no DTM file, or if the gallery cannot be written or already exists.
+    The name of each image is printed to standard error before it is rendered. Raises ValueError if a file is no DTM
+    file, or if the gallery cannot be written or already exists.
     """
     requests = [ImageRequest.from_defaults(site, camera, **values) for site, camera, values in VIEWS]
     for file in terrain_files:

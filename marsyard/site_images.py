@@ -85,9 +85,10 @@ class ImageRequest:
             "sun-elevation": (self.sun_elevation_deg, 0.0, 90.0),
         }
         for name, (value, low, high) in ranges.items():
-            is_above_minimum = value >= low if name == "elevation" else value > low
-            if not (is_above_minimum and value <= high):
-                allowed = f"{low:g}" if name == "elevation" else f"more than {low:g}"
+            # a camera may look straight down, but is above the ground, and the sun above the horizon
+            includes_low = name == "elevation"
+            if not (low <= value <= high) or (value == low and not includes_low):
+                allowed = f"{low:g}" if includes_low else f"more than {low:g}"
                 raise ValueError(f"--{name} {value:g} is out of range; allowed: {allowed} to {high:g}")
         for name in ("east_m", "north_m", "azimuth_deg", "sun_azimuth_deg"):
             if not math.isfinite(value := getattr(self, name)):

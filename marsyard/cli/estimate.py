@@ -1,4 +1,4 @@
-"""Time, disk space and limits of the evidence of a campaign, printed before it runs."""
+"""Estimates printed before a campaign runs: time, disk space, and requirements that cannot be PASS."""
 
 import os
 
@@ -57,10 +57,7 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     estimate = estimate_campaign(campaign, workers)
     total = campaign.definition.total_cases
     low, high = estimate.case_range_s
-    time_s = estimate.time_s
-    duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
-    duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
-    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration_text(estimate.time_s)}")
     if estimate.inputs:
         typer.echo(f"  {count(estimate.inputs, 'terrain')} (shared inputs) to build, {estimate.input_s:.3g} s each")
     trials = count(estimate.trials, "trial case")
@@ -72,6 +69,13 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     if estimate.inputs_bytes:
         limit = size_text(estimate.cache_limit_bytes)
         typer.echo(f"  {size_text(estimate.inputs_bytes)} of terrains in the cache (maximum {limit})")
+
+
+def _duration_text(time_s: float) -> str:
+    """Format a duration in the largest unit of which there are at least two."""
+    if time_s < 120.0:
+        return f"{time_s:.0f} s"
+    return f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
 
 
 def print_limits(campaign: Campaign) -> None:

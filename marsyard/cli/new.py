@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
+
 #: Name of the campaign file that `marsyard ingest` writes.
 CAMPAIGN_FILE = "campaign.toml"
 
@@ -79,8 +80,8 @@ def new(
     ask_camera, ask_flight = (
         is_interactive and option not in template.unsupported_options for option in ("camera", "flight")
     )
-    names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
-    site = site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
+    site_names = [key for key, preset in sites().items() if getattr(preset, template.scale) is not None]
+    site = site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, site_names))
     question = "Camera file (empty: the paper's camera)"
     camera = camera or _ask_user(question, "", ask_camera, _find_camera_problem)
     flight = flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -20,9 +20,6 @@ from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
 from marsyard.reports.wording import count, requirement_text
 from marsyard.scenarios.columns import split_unit
-
-if TYPE_CHECKING:
-    pass
 
 #: Width of a column of drawn values including its margin, characters.
 _VALUE_WIDTH = 12

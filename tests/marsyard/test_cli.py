@@ -204,6 +204,25 @@ def test_invalid_arguments_are_rejected(finished_run: Path, tmp_path: Path, argu
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("resume", ("--retry", "all")),
+        ("resume", ("--case-time", "5")),
+        ("resume", ("--allow-changed",)),
+        ("append", ("2", "--allow-changed")),
+    ],
+)
+def test_options_of_campaigns_are_rejected_for_studies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, options: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr("marsyard.cli.studies.contains_study", lambda directory: directory == tmp_path)
+    result = marsyard(command, tmp_path, *options)
+    assert result.status == 2
+    name = next(option for option in options if option.startswith("--"))
+    assert f"{name}: not for studies; {tmp_path} contains a study" in result.text
+
+
 def test_internal_error_has_status_2(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marsyard.scenarios.systems.catalogue", lambda: 1 / 0)
     result = marsyard("list")
