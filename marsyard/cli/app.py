@@ -47,7 +47,7 @@ PANELS = {
     },
     "Custom campaigns and algorithms": {
         "new": "new:new",
-        "ingest": "new:ingest",
+        "ingest": "ingest:ingest",
         "conformance": "conformance:conformance",
         "export": "export:export",
         "score": "export:score",

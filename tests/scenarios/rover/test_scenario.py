@@ -10,13 +10,8 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.scenario import RoverScenario
-from marsyard.scenarios.rover.shared_drive import (
-    DriveKey,
-    SharedDriveParameters,
-    SharedDriveScenario,
-    render_drive,
-    track_views,
-)
+from marsyard.scenarios.rover.shared_drive import DriveKey, SharedDriveScenario, render_drive, track_views
+from marsyard.scenarios.rover.shared_drive_parameters import SharedDriveParameters
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
