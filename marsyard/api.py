@@ -125,6 +125,7 @@ def run(
             raise CampaignError("cases, seed and changes are for a campaign that is given by its name or file")
         name = campaign.definition.name
     else:
+        # without changes and algorithms: algorithms given as objects are stored in the folder with this name first
         name = loading.load_campaign(str(campaign)).definition.name
     folder = default_directory(name) if directory is None else Path(directory)
     specs = _name_algorithms([*([] if algorithm is None else [algorithm]), *compare], folder / "algorithms")

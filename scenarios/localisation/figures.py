@@ -52,9 +52,9 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
                             landmarks_used: whether the position uses them
     """
     errors = compute_errors(descent, answers)
-    nothing = np.full(7, np.nan)
+    refusal = np.full(1 + 3 + 3, np.nan)  # time, position error and its standard deviation
     track = np.stack(
-        [nothing if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
+        [refusal if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
     )
     estimates = answers.estimates
     details = [estimate.details for estimate in estimates]

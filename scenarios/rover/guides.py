@@ -137,7 +137,7 @@ class DesignationGuide:
 
     @classmethod
     def designate(cls, run: RoverRun, margin_px: float, oracle: bool) -> DesignationGuide:
-        """Create the guide at the start; operators triangulate the point in images of the start.
+        """Create the guide at the start: operators triangulate the point in images of the start; an `oracle` knows it.
 
         Raises ValueError if the mast cannot point at the target or the point cannot be triangulated.
         """
