@@ -80,9 +80,10 @@ def new(
     camera = camera or _ask_user(question, "", ask_camera, _find_camera_problem)
     flight = flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
-    bound = math.nan if bound is None else bound
-    if math.isnan(bound):
+    if bound is None:
         bound = float(_ask_user(question, default, is_interactive, partial(_find_number_problem, template.max_bound)))
+    elif not math.isfinite(bound):
+        raise CampaignError(f"--bound {bound:g}: allowed: a finite number")
     choices = Choices(name, site, camera, detector or "", flight, axes, bound, cases)
     campaign = _write_and_load(path, template, choices)
     summary = f"{path}: {system} over {site}, {count(cases, 'case')}"
