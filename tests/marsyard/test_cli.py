@@ -118,6 +118,10 @@ def test_dry_run_only_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert re.search(r"^  0\.\d+ s per case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", result.out, re.MULTILINE)
     assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ MB of products$", result.out, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
+    result = marsyard("run", tmp_path / "fake.toml", "--dry-run", "-n", 3, "--cluster", "local:7")
+    assert "3 cases on 7 workers" in result.text
+    result = marsyard("run", tmp_path / "fake.toml", "--dry-run", "-n", 3, "--cluster", "tcp://host:8786")
+    assert "the cluster is assumed to have one worker per core" in result.text
 
 
 def _crashing_case_setting(case: int) -> str:
