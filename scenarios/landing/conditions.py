@@ -45,6 +45,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     # height and vertical at the first image; motion and rotation vector, body axes, to the second image
     first, second = case.flight.states
     motion = second.position_m - first.position_m
+    east, north, climb = motion
     positions = np.stack([first.position_m, second.position_m])
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
     up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
@@ -52,7 +53,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     within_limits = (
         roll < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
         and max(pitch, yaw) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
-        and abs(float(motion[2])) < (MAX_HEIGHT_CHANGE_FRACTION + _FRACTION_TOLERANCE) * pair.axis_range_m
+        and abs(float(climb)) < (MAX_HEIGHT_CHANGE_FRACTION + _FRACTION_TOLERANCE) * pair.axis_range_m
     )
     return {
         "site": p.site,
@@ -61,8 +62,8 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **sun_columns(case.world.sun.direction),
         "height_m": height,
         "baseline_m": float(np.linalg.norm(motion)),
-        "height_change_fraction": float(motion[2] / height),
-        "baseline_fraction": float(np.hypot(*motion[:2]) / height),
+        "height_change_fraction": float(climb / height),
+        "baseline_fraction": float(np.hypot(east, north) / height),
         "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
         **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),

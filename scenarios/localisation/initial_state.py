@@ -59,9 +59,10 @@ class InitialErrors(Parameters):
 
     def _truncation(self) -> float:
         """Return k = (maximum / sd)^2 / 2; the radius^2 / (2 sd^2) is exponentially distributed up to k."""
-        return 0.5 * (self.horizontal_max_m / max(self.horizontal_sd_m, 1e-6 * self.horizontal_max_m)) ** 2
+        sd_m = max(self.horizontal_sd_m, 1e-6 * self.horizontal_max_m)  # not 0
+        return 0.5 * (self.horizontal_max_m / sd_m) ** 2
 
     def _truncated_variance(self) -> float:
         """Compute the mean of an exponential distribution truncated at k, 1 - k / (e^k - 1): variance / sd^2."""
-        k = min(self._truncation(), 700.0)
+        k = min(self._truncation(), 700.0)  # e^k is finite
         return float(1.0 - k / np.expm1(k))

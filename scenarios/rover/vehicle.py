@@ -43,11 +43,10 @@ class Vehicle:
         ahead = np.array([np.sin(azimuth), np.cos(azimuth)])
         left = np.array([-ahead[1], ahead[0]])
         # the start distance is that of the mast's base, not of the rover's origin
-        base = rig.calibrated.geometry.base_m
+        base_forward_m, base_left_m, _ = rig.calibrated.geometry.base_m
         target = np.array([p.world.east_m, p.world.north_m])
-        position = (
-            target + (world.face_distance_m(p) + p.start.distance_m) * to_start - base[0] * ahead - base[1] * left
-        )
+        base = target + (world.face_distance_m(p) + p.start.distance_m) * to_start
+        position = base - base_forward_m * ahead - base_left_m * left
         ground: DrivenGround = world.ground.surface
         if p.world.rocks_underfoot:
             ground = world.route_ground
