@@ -73,6 +73,15 @@ def test_approach_reaches_distance_and_offset() -> None:
     np.testing.assert_allclose(goal_position(offset_leg, make_target(5.0, 0.0)), [3.0, -0.5])
 
 
+@pytest.mark.parametrize("motion", ["approach", "back-off"])
+@pytest.mark.parametrize("step_m", [0.0, -0.5])
+def test_step_towards_a_goal_is_positive(motion: str, step_m: float) -> None:
+    """A negative step would drive away from the goal, and zero would not drive at all."""
+    with pytest.raises(ValueError, match=f"step_m is {step_m:g}; allowed for motion '{motion}': above 0"):
+        LegParameters.model_validate({"motion": motion, "step_m": step_m})
+    assert LegParameters(motion="straight", step_m=step_m).step_m == step_m
+
+
 def test_circle_keeps_target_distance_and_bearing() -> None:
     leg = LegParameters(motion="circle", step_deg=10.0, steps=7)
     target = make_target(7.0, 0.5)
