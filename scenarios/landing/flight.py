@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.cameras import draw_calibrated
 from marsyard.scenarios.landing.faults import add_range_faults, add_receiver_outage, draw_received_images
-from marsyard.scenarios.landing.helicopter import Transit
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.pair_choice import choose_pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.views import nadir_pose
@@ -23,6 +23,8 @@ from marsyard.sim.terrain import Surface
 
 #: Minimum time between the two images, s; applies to a camera at rest.
 MIN_INTERVAL_S = 0.1
+#: Largest range of the laser's echo divided by the commanded height.
+MAX_RANGE_HEIGHTS = 5.0
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,19 @@ class LandingFlight:
     @classmethod
     def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> LandingFlight:
         """Create the flight of a case: choose a pair from a helicopter flight, or use the poses of the parameters."""
-        if p.helicopter is None:
-            states = true_states(p, surface, streams)
-            upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-            tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
-            up_body = Rotation.from_rotvec(tilt).apply(upright)
-            return cls(states, measure_poses(p, states, streams), up_body)
-        helicopter = add_receiver_outage(p.faults, p.helicopter)
+        if p.helicopter is not None:
+            return cls._from_helicopter(p, add_receiver_outage(p.faults, p.helicopter), surface, streams)
+        states = true_states(p, surface, streams)
+        upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+        tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
+        up_body = Rotation.from_rotvec(tilt).apply(upright)
+        return cls(states, measure_poses(p, states, streams), up_body)
+
+    @classmethod
+    def _from_helicopter(
+        cls, p: LandingScenarioParameters, helicopter: LandingHelicopterParameters, surface: Surface, streams: Streams
+    ) -> LandingFlight:
+        """Fly a helicopter, and choose two of its images."""
         ground = float(surface.height(p.location.east_m, p.location.north_m))
         height = helicopter.transit.height_m
         start_m = np.array([p.location.east_m, p.location.north_m, ground + height])
@@ -54,11 +62,11 @@ class LandingFlight:
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
-        # laser ranges to the ground, without rocks, at all images; no echo beyond five times the height
+        # laser ranges to the ground, without rocks, at all images
         motion = transit.flight.path.motion(transit.times_s)
         laser = RangingUnit.draw(p.laser, streams.generator("laser"))
         true_ranges = [
-            range_along(surface, position, axis, 5.0 * height)
+            range_along(surface, position, axis, MAX_RANGE_HEIGHTS * height)
             for position, axis in zip(motion.positions_m, motion.attitudes.apply(laser.axis), strict=True)
         ]
         readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))

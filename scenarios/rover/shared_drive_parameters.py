@@ -68,6 +68,10 @@ class SharedDriveParameters(Parameters):
         for name, index, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
             if index >= count:
                 raise ValueError(f"{name} is {index}; allowed: 0 to {count - 1}")
+        bank = self.drive.world.bank
+        for number, variant in enumerate(self.variants):
+            if variant.terrain >= bank:
+                raise ValueError(f"variants[{number}].terrain is {variant.terrain}; allowed: 0 to {bank - 1}, the bank")
         if len(self.drive.legs) != 1:
             raise ValueError(f"a shared drive must have one leg, not {len(self.drive.legs)}")
         return self

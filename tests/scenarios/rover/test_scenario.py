@@ -177,6 +177,12 @@ def test_step_of_a_shared_drive_is_that_of_its_leg() -> None:
         assert parameters.step == pytest.approx(step)
 
 
+def test_terrains_of_a_shared_drive_are_in_the_bank() -> None:
+    values = {"drive": {"world": {"bank": 2}}, "variants": [{"terrain": 1}, {"terrain": 2}], "targets": [{}]}
+    with pytest.raises(ValueError, match=r"variants\[1\].terrain is 2; allowed: 0 to 1"):
+        SharedDriveParameters.model_validate(values)
+
+
 @pytest.mark.slow
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
