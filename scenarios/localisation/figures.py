@@ -43,7 +43,7 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
 
         track               per estimate: time, error east, north, up, sd east, north, up (m); NaN for a refusal
         outcomes            outcome of each estimate
-        inliers             per estimate: landmarks used; NaN without a match, and for the final estimate
+        inliers             per estimate: landmarks used; NaN without a match
         true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
         initial_xy_m        initial position (east, north) of inertial navigation
         map                 appearance of the map, reduced; map_extent_m: west, east, south, north
