@@ -22,6 +22,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from marsyard.campaigns.definition import loading
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.campaigns.errors import CampaignError
@@ -240,6 +242,8 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 def _format_toml(value: Any) -> str:
     """Format a value in TOML syntax."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_format_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
