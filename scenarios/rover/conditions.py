@@ -74,7 +74,7 @@ def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Sca
         "incline": p.world.incline.name,
         "visual_odometry": any(leg.visual_odometry for leg in p.legs),
         "autonav": any(leg.autonav for leg in p.legs),
-        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
+        "map_by": next((leg.map_by for leg in p.legs if leg.uses_map), "none"),
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,

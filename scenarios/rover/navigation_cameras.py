@@ -107,7 +107,7 @@ class NavigationCameras:
     def draw(cls, p: RoverScenarioParameters, rig: Rig, streams: Streams) -> NavigationCameras:
         """Draw the calibration errors and detectors of the pairs that the legs use."""
         mapping_legs = p.legs if p.navigation.terrain == "stereo" else ()
-        mapped_by = {leg.map_by for leg in mapping_legs if leg.autonav or leg.maps_first}
+        mapped_by = {leg.map_by for leg in mapping_legs if leg.uses_map}
         uses_odometry = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
         mast = body = None
         if uses_odometry or "mast" in mapped_by:

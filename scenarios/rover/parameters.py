@@ -176,6 +176,11 @@ class LegParameters(Parameters):
             raise ValueError(f"autonav needs a leg of motion 'approach', not '{self.motion}'")
         return self
 
+    @property
+    def uses_map(self) -> bool:
+        """Whether the navigator maps the terrain in this leg."""
+        return self.autonav or self.maps_first
+
 
 SUN_MOTION = ErrorSource("sun", "motion of the sun")
 
