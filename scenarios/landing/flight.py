@@ -21,8 +21,8 @@ from marsyard.sim.sensor.altimeters import RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Minimum time between the two images, s; applies to a camera at rest.
-MIN_INTERVAL_S = 0.1
+#: Minimum time between the two images, s, and minimum speed from which it follows, m/s.
+MIN_INTERVAL_S, MIN_SPEED_M_S = 0.1, 1e-6
 #: Largest range of the laser's echo divided by the commanded height.
 MAX_RANGE_HEIGHTS = 5.0
 
@@ -100,7 +100,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     course = np.radians(pair.heading_deg + pair.course_deg)
     distance = pair.baseline_fraction * pair.height_m
     step = np.array([distance * np.sin(course), distance * np.cos(course), pair.climb_fraction * pair.height_m])
-    interval = max(float(np.linalg.norm(step)) / max(pair.speed_m_s, 1e-6), MIN_INTERVAL_S)
+    interval = max(float(np.linalg.norm(step)) / max(pair.speed_m_s, MIN_SPEED_M_S), MIN_INTERVAL_S)
     velocity = pair.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
     rates = np.radians(pair.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
     start = np.array(first.translation)

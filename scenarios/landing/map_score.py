@@ -160,7 +160,7 @@ def _subtract_plane(design: Float[np.ndarray, "n 3"], values: Float[np.ndarray, 
 
 
 def _robust_deviation(values: Float[np.ndarray, "n"]) -> float:
-    """Compute a robust standard deviation of at least 1e-12.
+    """Compute a robust standard deviation; at least 1e-12, so that ratios are finite.
 
     It is 1.4826 times the median absolute deviation: the ratio of the two for a normal distribution.
     """

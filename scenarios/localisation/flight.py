@@ -222,10 +222,9 @@ def _fly_powered(
     def derivative(time_s: float, y: Float64[np.ndarray, "19"]) -> Float64[np.ndarray, "19"]:
         velocity, acceleration, jerk = y[_VELOCITY], y[_ACCELERATION], y[_JERK]
         quaternion, rate = y[_ATTITUDE], y[_BODY_RATE]
-        guidance = np.empty(3)
-        guidance[:2] = _limit(-p.velocity_gain_per_s * velocity[:2], p.max_horizontal_m_s2)
-        sink = np.array([p.velocity_gain_per_s * (-p.descent_speed_m_s - velocity[2])])
-        guidance[2:] = _limit(sink, p.max_vertical_m_s2)
+        horizontal = _limit(-p.velocity_gain_per_s * velocity[:2], p.max_horizontal_m_s2)
+        vertical = p.velocity_gain_per_s * (-p.descent_speed_m_s - velocity[2:])
+        guidance = np.concatenate([horizontal, _limit(vertical, p.max_vertical_m_s2)])
         weight = _smooth_step((time_s - separation_s - p.free_fall_s) / p.start_up_s)
         command = weight * guidance - (1.0 - weight) * gravity_m_s2 * _UP
         snap = p.thrust_lag_rad_s**2 * (command - acceleration) - 2.0 * p.thrust_lag_rad_s * jerk

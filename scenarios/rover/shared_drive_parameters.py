@@ -72,6 +72,8 @@ class SharedDriveParameters(Parameters):
         for number, variant in enumerate(self.variants):
             if variant.terrain >= bank:
                 raise ValueError(f"variants[{number}].terrain is {variant.terrain}; allowed: 0 to {bank - 1}, the bank")
+        if self.drive.variants:
+            raise ValueError("drive.variants are runs of the scenario 'rover'; allowed in a shared drive: variants")
         if len(self.drive.legs) != 1:
             raise ValueError(f"a shared drive must have one leg, not {len(self.drive.legs)}")
         return self

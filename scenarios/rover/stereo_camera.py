@@ -120,7 +120,8 @@ class StereoCamera:
                 for window, radiance in zip(windows, radiances, strict=True)
             ]
         else:
-            gain = _EXACT_COUNT / max(float(np.percentile(radiances[0], _EXACT_PERCENTILE)), 1e-9)
+            brightness_at_count = float(np.percentile(radiances[0], _EXACT_PERCENTILE))
+            gain = _EXACT_COUNT / max(brightness_at_count, 1e-9)  # finite also without light
             full_scale = 2**_EXACT_BITS - 1
             counts = [np.clip(np.rint(gain * radiance), 0, full_scale).astype(np.uint16) for radiance in radiances]
         left, right = (MastImage(values, box.corner) for values, box in zip(counts, boxes, strict=True))

@@ -183,6 +183,13 @@ def test_terrains_of_a_shared_drive_are_in_the_bank() -> None:
         SharedDriveParameters.model_validate(values)
 
 
+def test_runs_of_the_other_scenario_are_rejected() -> None:
+    """A shared drive would ignore them."""
+    values = {"drive": {"variants": [{"diameter_m": 0.2}]}, "variants": [{}], "targets": [{}]}
+    with pytest.raises(ValueError, match="allowed in a shared drive: variants"):
+        SharedDriveParameters.model_validate(values)
+
+
 @pytest.mark.slow
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
