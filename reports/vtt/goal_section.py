@@ -43,9 +43,9 @@ def losses_grid(frame: pd.DataFrame) -> Grid:
 
 def losses_note(frame: pd.DataFrame) -> str:
     """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
-    occurring = ", ".join(frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(
-        ", "
-    )
+    # a run can be lost by several criteria
+    losses = frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)
+    occurring = {name for names in losses for name in names.split(", ")}
     meanings = [
         f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
     ]
@@ -162,20 +162,19 @@ def pointing_error_cm(range_m: float) -> float:
 
 def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
     """Describe the errors, those of the paper's cameras by Eqs. 1 and 4, and the runs that the quantiles need."""
-    designs = (PANCAM, NAVCAM)
-    stereo, drift = (
-        " and ".join(f"{100.0 * error_m:.{digits}f} cm ({design.name.lower()})" for design, error_m in errors)
-        for digits, errors in (
-            (2, [(design, stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)) for design in designs]),
-            (3, [(design, drift_error_m(GOAL_M, design.focal_px, 1.0)) for design in designs]),
-        )
-    )
+    stereo_texts, drift_texts = [], []
+    for camera in (PANCAM, NAVCAM):
+        stereo_cm = 100.0 * stereo_range_error_m(GOAL_M, camera.focal_px, camera.baseline_m)
+        drift_cm = 100.0 * drift_error_m(GOAL_M, camera.focal_px, 1.0)
+        stereo_texts.append(f"{stereo_cm:.2f} cm ({camera.name.lower()})")
+        drift_texts.append(f"{drift_cm:.3f} cm ({camera.name.lower()})")
     text = (
         "The position error is the distance of the reported from the true position of the designated point, in the "
         "rover frame. Drift: distance in the last image from the tracked target to the true projection. By Eqs. 1 and "
-        f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {stereo} along the line of sight, and 1 px of "
-        f"drift is {drift} across it. The measured errors also contain errors of the camera calibration and of the "
-        f"mast's pointing: {_POINTING_ERROR_DEG:g} deg is {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
+        f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {' and '.join(stereo_texts)} along the line of "
+        f"sight, and 1 px of drift is {' and '.join(drift_texts)} across it. The measured errors also contain errors "
+        f"of the camera calibration and of the mast's pointing: {_POINTING_ERROR_DEG:g} deg is "
+        f"{pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
     )
     if all(np.isfinite(row["quantile_bound_m"]) for row in cameras):
         return text
