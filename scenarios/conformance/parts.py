@@ -56,10 +56,7 @@ def determine_kind(spec: str) -> str | None:
         return next((kind.name for kind in (DYNAMICS, INSTRUMENT) if hasattr(part, kind.members[0])), None)
     if not callable(part):
         return None
-    accepted_types = scores.accepted_cases(part)
-    # the types of a function without annotation are all types
-    is_annotated = accepted_types != scores.SCORED
-    return SCORE.name if accepted_types and is_annotated else None
+    return SCORE.name if scores.annotated_cases(part) else None
 
 
 @dataclass(frozen=True)
