@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import Haze, SizedFaults
@@ -56,6 +56,13 @@ class DescentFaults(SizedFaults):
     attitude_error_once_deg: Annotated[
         NonNegative, Field(le=90.0, description="additional tilt error of the attitude of image 2")
     ] = 0.0
+
+    @field_validator("repeated_image")
+    @classmethod
+    def _check_repeated_image(cls, number: int) -> int:
+        if number == 1:
+            raise ValueError("repeated_image is 1, which no image precedes; allowed: 2 or 3, or 0 for none")
+        return number
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the detector parameters that the faults change, including interference bursts on the camera cable."""
