@@ -26,10 +26,9 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent
 from marsyard.scenarios.terrain_scenario import TerrainScenario
-from marsyard.scenarios.velocity import (
-    VELOCITY,
+from marsyard.scenarios.velocity import VELOCITY, run_estimator
+from marsyard.scenarios.velocity_score import (
     consistency_row,
-    run_estimator,
     stream_products,
     stream_row,
     velocity_products,

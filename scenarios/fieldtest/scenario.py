@@ -20,7 +20,8 @@ from marsyard.scenarios.fieldtest.triples import find_triple
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.scores import ScoredFlight
 from marsyard.scenarios.terrain_scenario import TerrainScenario
-from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.velocity import VELOCITY, check_last_interval
+from marsyard.scenarios.velocity_score import consistency_row, velocity_products, velocity_row
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 

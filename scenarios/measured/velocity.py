@@ -31,14 +31,8 @@ from marsyard.scenarios.measured.store import MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
 from marsyard.scenarios.typed_scenario import TypedScenario
-from marsyard.scenarios.velocity import (
-    VELOCITY,
-    check_image_size,
-    check_last_interval,
-    consistency_row,
-    velocity_products,
-    velocity_row,
-)
+from marsyard.scenarios.velocity import VELOCITY, check_image_size, check_last_interval
+from marsyard.scenarios.velocity_score import consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.streams import Streams
