@@ -28,7 +28,8 @@ PRODUCT = "timeline"
 def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True) -> dict[str, Any]:
     """Return the timeline as a product; empty, without a call of `create`, unless timelines are recorded.
 
-    is_tested: whether the products are those of the algorithm under test; other products are not stored
+    - is_tested: whether the products are those of the algorithm under test; other products are not stored
+
     An exception of `create` does not affect the case: its text is stored instead of the timeline.
     """
     if not is_recording_timelines() or not is_tested:

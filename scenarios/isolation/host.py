@@ -180,7 +180,7 @@ def seed_generators(seed: int) -> None:
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed(seed)
     if "cv2" in sys.modules:
-        sys.modules["cv2"].setRNGSeed(seed & 0x7FFFFFFF)
+        sys.modules["cv2"].setRNGSeed(seed & 0x7FFFFFFF)  # a signed 32-bit integer
 
 
 if __name__ == "__main__":

@@ -36,6 +36,8 @@ _MAX_FEATURES, _MAX_DISTANCE_RATIO = 4000, 0.8
 _MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
 #: Minimum number of matches: an essential matrix can be fitted exactly to any five matches, right or wrong.
 MIN_MATCHES = 15
+#: Smallest cosine between a ray and the optical axis for normalised coordinates: 89.9 deg; limits those of wider rays.
+_MIN_AXIS_COSINE = 1e-3
 #: Distance that represents infinity, m.
 _INFINITY_M = 1e7
 #: Quantiles of the counts that are mapped to black and white before feature detection.
@@ -167,7 +169,7 @@ def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Fe
             # normalised image coordinates: intersections of the rays with the plane at unit distance
             axes = np.stack([image.camera.right, image.camera.down, image.camera.a])
             x, y, z = (image.camera.rays(image_pixels)[1] @ axes.T).T
-            points.append(np.stack([x, y], axis=1) / np.maximum(z, 1e-3)[:, None])
+            points.append(np.stack([x, y], axis=1) / np.maximum(z, _MIN_AXIS_COSINE)[:, None])
         focal = 0.5 * sum(float(np.sqrt(np.prod(image.camera.focal_lengths))) for image in images)
         limit = _MAX_DISTANCE_PX / focal
         _, mask = cv2.findEssentialMat(
