@@ -31,6 +31,8 @@ _CLEARANCE_M = 0.03
 _TOP_HAT_SIDES, _MIN_TOP_HAT_PX = 3.0, 3
 #: Threshold of candidates: standard deviations of the top-hat image, estimated from its quantiles.
 _THRESHOLD_SD = 5.0
+#: Maximum displacement of the predicted targets, in standard deviations of the prior attitude.
+_PRIOR_SD = 4.0
 #: Half side of the window of a centroid, divided by the side length of a target in the image.
 _WINDOW_SIDES = 1.5
 #: Maximum distance of a candidate from a predicted target, in metres on the ground: for the common displacement (the
@@ -171,8 +173,7 @@ def detect_targets(
     # distances in metres on the ground, as pixels need not be square
     tree = cKDTree(candidates / px_per_m)
     predicted = camera.project(prior.inv().apply(offsets))[0] / px_per_m
-    # search within four standard deviations of the prior
-    displacement = _find_displacement(tree, predicted, 4.0 * prior_sd_rad * height)
+    displacement = _find_displacement(tree, predicted, _PRIOR_SD * prior_sd_rad * height)
     attitude, max_distance_m = prior, _MAX_VOTE_DISTANCE_M
     predicted = predicted + displacement
     for _ in range(_ITERATIONS):
@@ -227,7 +228,8 @@ def _find_displacement(
 ) -> Float64[np.ndarray, "2"]:
     """Find the displacement that moves the largest number of predicted targets to a candidate.
 
-    The displacements from each target to the candidates within `radius_m` are tried.
+    The displacements from each target to the candidates within `radius_m` are tried; the first of equal ones is
+    returned, and zero without any candidate.
     """
     neighbours = tree.query_ball_point(predicted_m, radius_m)
     displacements = np.concatenate(
