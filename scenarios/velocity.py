@@ -76,7 +76,7 @@ def run_estimator(
     other estimators use the three images of `triple`. It is None if the descent has fewer than three images; the result
     for these estimators is then a failure with a message.
     """
-    tags = measurements.tags_s
+    tags = measurements.tags_s  # of the images that the estimator receives, to which its answer refers
 
     def estimate(estimator: VelocityEstimator, inputs: DescentMeasurements) -> object:
         nonlocal tags
