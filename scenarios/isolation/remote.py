@@ -110,7 +110,7 @@ class RemoteAlgorithm:
         start_s, start_remote_s = time.process_time(), self._processor_time_s()
         layout = self._sender.send(arguments)
         answer = self._request("call", {"member": method, **asdict(layout)})
-        _Time.correction_s += self._processor_time_s() - start_remote_s
+        _Time.correction_s += max(self._processor_time_s() - start_remote_s, 0.0)
         value = decode(answer.get("value"), self._classes)
         _Time.correction_s -= time.process_time() - start_s
         return value
@@ -118,7 +118,7 @@ class RemoteAlgorithm:
     def _processor_time_s(self) -> float:
         try:
             return processor_time_s(self._process)
-        except OSError:  # the process has ended, which the next request reports
+        except OSError:  # the process has ended, which the next request reports; its time is lost
             return 0.0
 
     def _request(self, action: str, values: Mapping[str, Any], time_s: float | None = None) -> Mapping[str, Any]:
