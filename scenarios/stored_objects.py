@@ -133,7 +133,8 @@ def _class_members(owner: type) -> list[Any]:
     """List the bases, the functions and the values of the attributes of a class, without those of its bases."""
     members: list[Any] = [base for base in owner.__bases__ if base is not object]
     for name, item in vars(owner).items():
-        accessors = [item.fget, item.fset, item.fdel] if isinstance(item, property) else [item]
+        accessors: list[Any] = [item.fget, item.fset, item.fdel] if isinstance(item, property) else [item]
+        # those of static and class methods, and below decorators
         functions = [inspect.unwrap(getattr(accessor, "__func__", accessor)) for accessor in accessors]
         if any(map(inspect.isfunction, functions)):
             members += filter(inspect.isfunction, functions)

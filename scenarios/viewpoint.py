@@ -48,6 +48,7 @@ class Viewpoint:
         height = up - float(surface.height(east, north))
         axis = world_from_body.rotation.apply(rays.axis)
         elevation, half_angle = float(np.arcsin(np.clip(axis[2], -1.0, 1.0))), rays.half_angle_rad
+        # the azimuths of a cone around the axis; all if it contains the nadir or the zenith
         horizontal = float(np.cos(elevation))
         is_full_circle = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
         half_width = np.pi if is_full_circle else np.arcsin(np.sin(half_angle) / horizontal)

@@ -158,7 +158,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     task = VELOCITY
     scored = ScoredFlight
 
-    algorithm: Annotated[str, Field(description="velocity estimator under test, see `estimators`")] = "dimes"
+    algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or custom")] = "dimes"
     runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="runs in the order of the report")]
     bank_seed: Annotated[int, Field(ge=0, description="seed of the sites' terrains; each site has one")] = 1
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side of a terrain")] = 4096

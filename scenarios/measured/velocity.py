@@ -83,6 +83,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
         }
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
+        _, inertial_m_s = measurements.interval_velocities_m_s[:, :2]  # of the second interval, as the estimate
 
         def run(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
             check = partial(check_last_interval, measurements=measurements)
@@ -99,7 +100,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
                 "velocity_estimated_x_m_s": float(estimate_m_s[0]),
                 "velocity_estimated_y_m_s": float(estimate_m_s[1]),
                 # estimated minus inertial velocity, which has an unknown constant error
-                "inertial_difference_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+                "inertial_difference_m_s": distance(velocity, inertial_m_s),
                 # estimated minus inertial velocity change between the intervals, in which this error cancels
                 "pair_discrepancy_m_s": np.nan if velocity_pair is None else velocity_pair.discrepancy_m_s,
                 **agreement_row(pairs),
