@@ -72,7 +72,10 @@ def _remove_repeated(faces: Faces) -> Faces:
 
 
 def _edges(faces: Faces) -> tuple[Int64[np.ndarray, "edges"], Bool[np.ndarray, "edges"]]:
-    """Return the number of each triangle's edges, equal for shared edges, and whether each ascends in its indices."""
+    """Return a number for each of the three edges of each triangle, equal for shared edges, and whether it ascends.
+
+    An edge ascends if the index of its first vertex, in the winding of the triangle, is smaller than the second.
+    """
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     pairs = np.minimum(starts, ends) * (int(faces.max()) + 1) + np.maximum(starts, ends)
     _, numbers = np.unique(pairs, return_inverse=True)
@@ -82,20 +85,23 @@ def _edges(faces: Faces) -> tuple[Int64[np.ndarray, "edges"], Bool[np.ndarray, "
 def _unify_winding(faces: Faces) -> tuple[Faces, Bodies, Bool[np.ndarray, "bodies"]]:
     """Give the triangles of each body one winding; return them, their bodies, and whether each body has an orientation.
 
-    The graph has two nodes for each triangle: as it is, and reversed. Neighbours with the same winding connect equal
-    states, the others different states. The two states of a triangle are connected only if a body has no orientation.
+    The graph has two nodes for each triangle k: 2 k, as it is, and 2 k + 1, reversed. An edge that triangles k and m
+    share links the nodes that agree: 2 k with 2 m and 2 k + 1 with 2 m + 1 if both have the same winding, else 2 k with
+    2 m + 1 and 2 k + 1 with 2 m. An orientable body is therefore two components, one for each winding. The two nodes of
+    a triangle are in one component only if its body has no orientation.
     """
     numbers, is_ascending = _edges(faces)
     order = np.argsort(numbers, kind="stable")
     counts = np.bincount(numbers)
     first = (np.cumsum(counts) - counts)[counts == 2]
-    left, right = order[first], order[first + 1]
+    left, right = order[first], order[first + 1]  # the two edges of equal number; edge n is one of triangle n // 3
     # two triangles with the same winding pass their common edge in opposite directions
     differs = (is_ascending[left] == is_ascending[right]).astype(np.int64)
     rows, columns = 2 * (left // 3), 2 * (right // 3)
     nodes = 2 * len(faces)
     links = np.concatenate([rows, rows + 1]), np.concatenate([columns + differs, columns + 1 - differs])
     graph = coo_array((np.ones(len(links[0]), dtype=np.int8), links), shape=(nodes, nodes))
+    # the component of each triangle as it is, and reversed
     states = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64).reshape(-1, 2)
     _, body = np.unique(states.min(axis=1), return_inverse=True)
     is_orientable = np.ones(int(body.max()) + 1, dtype=np.bool_)

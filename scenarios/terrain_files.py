@@ -63,18 +63,6 @@ def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
 CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
 
 
-def site_validator(user: str, scale: str) -> AfterValidator:
-    """Return a validator of site names: presets with a terrain at the scale; `user` is a noun for messages."""
-
-    def check(name: str | None) -> str | None:
-        allowed = [item.name for item in sites().values() if getattr(item, scale) is not None]
-        if name is not None and name not in allowed:
-            raise ValueError(f"unknown site '{name}' for {user}; allowed: {', '.join(allowed)}")
-        return name
-
-    return AfterValidator(check)
-
-
 def check_source(source: RealTerrain) -> None:
     """Raise TerrainFileError for invalid files; the message contains the file and the problem."""
     paths = [path for path in (source.dtm, source.ortho) if path is not None]

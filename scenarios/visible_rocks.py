@@ -48,6 +48,7 @@ def select_rocks(
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, viewpoint), _detail_pixel_rad(field, viewpoint)
     smallest_m = float(field.diameter_m.min())
+    # with a margin for rounding
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9)
     # maximum distance of each size class, and its horizontal part
     distance_m = smallest_m * _CLASS_RATIO ** (size_class + 0.5) / smallest_rad

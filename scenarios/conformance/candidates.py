@@ -55,7 +55,8 @@ class Subject:
         """Return the conformance suite of the algorithm or part."""
         if self.task in KINDS:
             kind = KINDS[self.task]
-            return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
+            create = partial(parts.load_part, kind, self.spec)
+            return parts.PartSuite(create, self.spec, is_program=False, limit_s=self.limit_s, kind=kind)
         task = tasks()[self.task]
         limits = ExecutableLimits(time_s=self.limit_s, isolated=False)
         is_program = self.spec.startswith(tuple(PREFIXES))

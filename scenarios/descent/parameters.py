@@ -23,8 +23,9 @@ from marsyard.scenarios.site_parameters import (
     SunParameters,
     complete_terrain,
     preset_terrain,
+    site_validator,
 )
-from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
+from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.scenarios.velocity import VELOCITY, check_image_size
 from marsyard.sim.dynamics.pendulum import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, SHADOW

@@ -9,7 +9,7 @@ from pydantic import AwareDatetime, Field, model_validator
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
-from marsyard.scenarios.terrain_files import site_validator
+from marsyard.scenarios.site_parameters import site_validator
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.error_sources import ATTITUDE, ErrorSource

@@ -198,19 +198,24 @@ def find_bright_spots(
 
     - side_px: side lengths of a target in the image (columns, rows)
     """
-    size = 2 * np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int) + 1
-    top_hat = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
+    half_sides = np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int)
+    columns, rows = (2 * half_sides + 1).tolist()
+    top_hat = ndimage.white_tophat(image.astype(np.float32), size=(rows, columns))
     # 84.13 % of a normal distribution are below its mean plus one standard deviation
     median, high = np.percentile(top_hat, (50.0, 84.13))
     labels, count = ndimage.label(top_hat > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
     peaks = np.array(ndimage.maximum_position(top_hat, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
-    return _compute_centroids(top_hat, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
+    half_columns, half_rows = np.ceil(_WINDOW_SIDES * side_px).astype(np.int64)
+    return _compute_centroids(top_hat, peaks, np.array([half_rows, half_columns]))
 
 
 def _compute_centroids(
     top_hat: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half_size: Int64[np.ndarray, "2"]
 ) -> Float64[np.ndarray, "spots 2"]:
-    """Compute the centroids (column, row) of intensity in windows around peaks (row, column)."""
+    """Compute the centroids (column, row) of intensity in windows around peaks (row, column).
+
+    - half_size: half sides of the windows (rows, columns), without the pixel of the peak
+    """
     is_inside = ((peaks >= half_size) & (peaks < np.array(top_hat.shape) - half_size)).all(axis=1)
     rows, columns = np.mgrid[-half_size[0] : half_size[0] + 1, -half_size[1] : half_size[1] + 1]
     windows = top_hat[peaks[is_inside, 0, None, None] + rows, peaks[is_inside, 1, None, None] + columns].astype(
