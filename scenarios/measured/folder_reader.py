@@ -84,15 +84,7 @@ class FolderReader:
         truth = self._read_truth(images)
         if self.file.task == VELOCITY:
             measurements["interval_velocities_m_s"] = tuple(map(self._mean_velocity, images, images[1:]))
-            angles, sun = rows[0].vector("sun_azimuth_deg", "sun_elevation_deg"), self.file.sun
-            if angles is not None:
-                azimuth, elevation = angles.tolist()
-                if not 0.0 < elevation <= 90.0:
-                    raise rows[0].error(f"sun_elevation_deg is {elevation:g}; allowed: above 0, at most 90")
-                sun = SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
-            if sun is None:
-                raise rows[0].error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
-            measurements["sun_direction"] = _to_vector(sun.direction)
+            measurements["sun_direction"] = _to_vector(self._sun(rows[0]).direction)
         elif self.file.task == LANDING:
             measurements["slant_range_m"] = rows[0].numbers.get("slant_range_m")
             measurements["site_m"] = self._apriori_site(images[0], measurements["slant_range_m"])
@@ -153,9 +145,16 @@ class FolderReader:
     def _read_counts(
         self, row: ImageRow, path: Path, camera: CameraModel, product: Pds3Product | None
     ) -> UInt16[np.ndarray, "rows columns"]:
-        """Return the counts of an image, which the detector's bits can represent."""
+        """Return the counts of an image, which have the size of the camera and the bits of the detector."""
         is_published = self.file.task == MAP
         counts = read_counts(path, camera.size, is_published=is_published) if product is None else product.counts
+        rows, columns = counts.shape
+        if (columns, rows) != camera.size:
+            camera_columns, camera_rows = camera.size
+            raise row.error(
+                f"{path}: has {columns} x {rows} pixels; its camera has {camera_columns} x {camera_rows} "
+                "(columns x rows)"
+            )
         max_count = (1 << self.file.detector.bits) - 1
         if counts.max() > max_count:
             raise row.error(
@@ -248,6 +247,18 @@ class FolderReader:
         if start_m is None or end_m is None:
             raise later.row.error("vx_m_s to vz_m_s and the positions are empty; velocity needs one of them")
         return _to_vector((end_m - start_m) / (later.time_s - earlier.time_s))
+
+    def _sun(self, row: ImageRow) -> SunTable:
+        """Return the sun of a case: that of its first row, by default that of the folder."""
+        angles = row.vector("sun_azimuth_deg", "sun_elevation_deg")
+        if angles is None:
+            if self.file.sun is None:
+                raise row.error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
+            return self.file.sun
+        azimuth, elevation = angles.tolist()
+        if not 0.0 < elevation <= 90.0:
+            raise row.error(f"sun_elevation_deg is {elevation:g}; allowed: above 0, at most 90")
+        return SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
 
     def _apriori_site(self, image: _RecordedImage, slant_range_m: float | None) -> store.Vector:
         """Return the a-priori site: as recorded, or the ground on the first image's optical axis."""
