@@ -45,7 +45,7 @@ def map_scale(file: Any) -> MapScale | None:
     step = max(abs(cell.a), 1.0)
     xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]  # west, east, south, north
     try:
-        terms, unit_m = file.crs.to_dict(), float(file.crs.linear_units_factor[1])
+        terms, (_, unit_m) = file.crs.to_dict(), file.crs.linear_units_factor
         body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
         body_fixed = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
         west, east, south, north = np.array(transform(file.crs, body_fixed, xs, ys, [0.0] * 4), dtype=np.float64).T

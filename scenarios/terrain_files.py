@@ -193,7 +193,8 @@ def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None 
             raise TerrainFileError(f"{path}: contains values of type {file.dtypes[0]}; allowed: heights in metres")
         nodata = "has no nodata value" if file.nodata is None else f"has the nodata value {file.nodata:g}"
         advice = f"it {nodata}; set the value for missing data with rio edit-info --nodata"
-        posting_m = float(file.transform.a) * float(file.crs.linear_units_factor[1])
+        _, unit_m = file.crs.linear_units_factor
+        posting_m = float(file.transform.a) * float(unit_m)
         _check_values(path, read_heights(file), posting_m, dtm_source, advice)
         return file.crs
 

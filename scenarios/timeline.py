@@ -97,6 +97,7 @@ class CameraPose:
         """Create the pose of a camera that is fixed to a body."""
         axes = np.column_stack([camera.right, camera.down, camera.a])
         rotation = world_from_body.rotation * Rotation.from_matrix(axes)
+        _, corner_directions = camera.corner_rays()
         distortion = np.empty(0)
         if isinstance(camera, Cahvor | Cahvore):
             distortion = np.concatenate([axes.T @ camera.o, camera.r])
@@ -108,7 +109,7 @@ class CameraPose:
             np.array(camera.focal_lengths, dtype=np.float64),
             np.array(camera.image_centre, dtype=np.float64),
             distortion,
-            camera.corner_rays()[1] @ axes,
+            corner_directions @ axes,
         )
 
 

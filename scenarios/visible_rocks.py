@@ -28,6 +28,10 @@ DETAIL_TRIANGLES = 1_200_000
 _COARSE_TRIANGLES = 20
 #: Ratio of the diameters of neighbouring size classes of rocks; rocks of one class are selected up to one distance.
 _CLASS_RATIO = float(np.sqrt(2.0))
+#: Margin for rounding, and smallest divisor.
+_ROUNDING = 1e-9
+#: Smallest sine of the elevation of a line of sight, and of its angle from the vertical, for its tangent.
+_MIN_SINE = 1e-4
 #: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
 _SILHOUETTE_FRACTION = 0.85
 
@@ -48,8 +52,7 @@ def select_rocks(
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, viewpoint), _detail_pixel_rad(field, viewpoint)
     smallest_m = float(field.diameter_m.min())
-    # with a margin for rounding
-    size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9)
+    size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + _ROUNDING)
     # maximum distance of each size class, and its horizontal part
     distance_m = smallest_m * _CLASS_RATIO ** (size_class + 0.5) / smallest_rad
     radius_m = np.sqrt(np.maximum(distance_m**2 - viewpoint.height_m**2, 0.0))
@@ -113,7 +116,7 @@ def _find_near_rocks(
         distance, extent_within = distance[within], extent[within]
         bearing = np.arctan2(east[within], north[within]) - viewpoint.azimuth_rad
         bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
-        widening = np.arcsin(np.minimum(extent_within / np.maximum(distance, 1e-9), 1.0))
+        widening = np.arcsin(np.minimum(extent_within / np.maximum(distance, _ROUNDING), 1.0))
         is_in_sector = bearing <= viewpoint.half_width_rad + widening
         is_selected[within] |= is_in_sector | (distance <= viewpoint.near_m + extent_within)
     return is_selected
@@ -124,8 +127,8 @@ def _find_visible_triangles(mesh: RockMesh, viewpoint: Viewpoint) -> Bool[np.nda
     offsets = mesh.vertices[:, :2] - (viewpoint.east_m, viewpoint.north_m)
     distance = np.hypot(*offsets.T)
     forward = offsets @ (np.sin(viewpoint.azimuth_rad), np.cos(viewpoint.azimuth_rad))
-    # with a margin for rounding, so that a half width of pi selects all
-    min_cosine = np.cos(viewpoint.half_width_rad) - 1e-9
+    # with a margin, so that a half width of pi selects all
+    min_cosine = np.cos(viewpoint.half_width_rad) - _ROUNDING
     is_selected = (forward >= min_cosine * distance) | (distance <= viewpoint.near_m)
     return np.asarray(is_selected[mesh.faces[:, 0]])
 
@@ -151,8 +154,9 @@ def add_unresolved_rocks(
     unresolved_counts = np.searchsorted(
         rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0)
     )
-    up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]
-    tan_elevation = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
+    _, _, up_in_body = frame.world_from_body.rotation.as_matrix()
+    up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ up_in_body
+    tan_elevation = np.maximum(-up, _MIN_SINE) / np.sqrt(np.maximum(1.0 - up**2, _MIN_SINE**2))
     occluded_fraction = -np.expm1(-area_below[unresolved_counts] / np.hypot(tan_elevation, rms_slope)).astype(
         np.float32
     )

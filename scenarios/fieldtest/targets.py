@@ -113,7 +113,7 @@ class Sightings:
         rows = []
         for tag, position, centroids in zip(tags_s, gps_m, centroids_px, strict=True):
             is_measured = np.isfinite(centroids).all(axis=1)
-            directions = camera.rays(centroids[is_measured])[1]
+            _, directions = camera.rays(centroids[is_measured])
             offsets = targets.surveyed_m[is_measured] - position
             rows.append((np.full(len(offsets), tag), normalize(directions), normalize(offsets)))
         times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
@@ -181,7 +181,7 @@ def detect_targets(
         matches = np.flatnonzero(distances < max_distance_m)
         if len(matches) < _MIN_TARGETS:
             return no_centroids
-        measured_directions = camera.rays(candidates[np.asarray(nearest)[matches]])[1]
+        _, measured_directions = camera.rays(candidates[np.asarray(nearest)[matches]])
         attitude = Rotation.align_vectors(normalize(offsets[matches]), normalize(measured_directions))[0]
         predicted, max_distance_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _MAX_FIT_DISTANCE_M
     distances, nearest = tree.query(predicted)

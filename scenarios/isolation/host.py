@@ -149,7 +149,7 @@ class Host:
 
 
 def construct(factory: Callable[..., Any], device: str) -> Any:
-    """Construct an algorithm; a factory with a parameter `device` receives the device."""
+    """Construct an algorithm, here or in a worker; a factory with a parameter `device` receives the device."""
     parameters: Mapping[str, Any] = {}
     with contextlib.suppress(ValueError, TypeError):  # built-in classes have no signature
         parameters = inspect.signature(factory).parameters
@@ -157,7 +157,7 @@ def construct(factory: Callable[..., Any], device: str) -> Any:
 
 
 def reset(algorithm: Any) -> None:
-    """Reset an algorithm at the start of a case, if it has the method."""
+    """Reset an algorithm, here or in a worker, at the start of a case, if it has the method."""
     if callable(getattr(algorithm, "reset", None)):
         algorithm.reset()
 

@@ -117,7 +117,8 @@ def infer_summed_rows(camera: CameraModel) -> int:
 
     Returns 1 if the ratio is not near a whole number: then the pixels are not sums of square pixels.
     """
-    ratio = camera.focal_lengths[0] / camera.focal_lengths[1]
+    focal_columns, focal_rows = camera.focal_lengths
+    ratio = focal_columns / focal_rows
     divisor = round(ratio)
     is_whole = 1 < divisor <= _MAX_SUMMED_ROWS and abs(ratio - divisor) <= _RATIO_TOLERANCE * divisor
     return divisor if is_whole else 1

@@ -164,7 +164,8 @@ def _resample(image: PosedImage, map_product: MapProduct, options: LvsOptions) -
     shape = (rows * _TILE_PX, columns * _TILE_PX)
     mosaic = values.reshape(rows, columns, _TILE_PX, _TILE_PX).swapaxes(1, 2).reshape(shape)
     valid = inside.reshape(rows, columns).repeat(_TILE_PX, axis=0).repeat(_TILE_PX, axis=1)
-    appearance = map_product.appearance[low[1] : low[1] + shape[0], low[0] : low[0] + shape[1]]
+    first_column, first_row = low
+    appearance = map_product.appearance[first_row:, first_column:][: shape[0], : shape[1]]
     return ImageFootprint(low, mosaic, appearance, valid)
 
 
@@ -219,9 +220,9 @@ def _errors_px(pixels: Points2, map_pixels: Points2, alignment: Float[np.ndarray
 
 def _template_corners(valid: Bool[np.ndarray, "rows columns"]) -> Iterator[tuple[int, int]]:
     """Yield the corners (row, column) of the templates in the image whose search windows lie in the footprint."""
-    last = np.array(valid.shape) - _TEMPLATE_PX - _SEARCH_PX
-    for row in range(_SEARCH_PX, int(last[0]) + 1, _TEMPLATE_STEP_PX):
-        for column in range(_SEARCH_PX, int(last[1]) + 1, _TEMPLATE_STEP_PX):
+    rows, columns = (range(_SEARCH_PX, side - _TEMPLATE_PX - _SEARCH_PX + 1, _TEMPLATE_STEP_PX) for side in valid.shape)
+    for row in rows:
+        for column in columns:
             if valid[row : row + _TEMPLATE_PX, column : column + _TEMPLATE_PX].all():
                 yield row, column
 

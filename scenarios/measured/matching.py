@@ -40,8 +40,8 @@ MIN_MATCHES = 15
 _MIN_AXIS_COSINE = 1e-3
 #: Distance that represents infinity, m.
 _INFINITY_M = 1e7
-#: Quantiles of the counts that are mapped to black and white before feature detection.
-_CONTRAST_QUANTILES = (0.005, 0.995)
+#: Quantiles of the counts that are mapped to black and white before feature detection, and their minimum difference.
+_CONTRAST_QUANTILES, _MIN_CONTRAST = (0.005, 0.995), 1e-9
 
 _Features: TypeAlias = tuple[Float64[np.ndarray, "n 2"], np.ndarray]
 #: Outcomes of `MatchingScenario`, which runs no algorithm.
@@ -130,7 +130,7 @@ def _detect_features(image: DetectorImage) -> _Features:
     signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     binned = signal.reshape(rows // row_bin, row_bin, columns // column_bin, column_bin).mean(axis=(1, 3))
     black, white = np.quantile(binned, _CONTRAST_QUANTILES)
-    grey = np.clip((binned - black) / max(white - black, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
+    grey = np.clip((binned - black) / max(white - black, _MIN_CONTRAST) * 255.0, 0.0, 255.0).astype(np.uint8)
     points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
@@ -168,7 +168,8 @@ def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Fe
         for image, image_pixels in zip(images, pixels, strict=True):
             # normalised image coordinates: intersections of the rays with the plane at unit distance
             axes = np.stack([image.camera.right, image.camera.down, image.camera.a])
-            x, y, z = (image.camera.rays(image_pixels)[1] @ axes.T).T
+            _, directions = image.camera.rays(image_pixels)
+            x, y, z = (directions @ axes.T).T
             points.append(np.stack([x, y], axis=1) / np.maximum(z, _MIN_AXIS_COSINE)[:, None])
         focal = 0.5 * sum(float(np.sqrt(np.prod(image.camera.focal_lengths))) for image in images)
         limit = _MAX_DISTANCE_PX / focal
