@@ -19,12 +19,11 @@ from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.matching import (
+from marsyard.scenarios.measured.matching import case_row, distance
+from marsyard.scenarios.measured.pose_agreement import (
     agreement_products,
     agreement_row,
-    case_row,
     compare_with_poses,
-    distance,
     match_images,
 )
 from marsyard.scenarios.measured.store import MeasuredParameters
