@@ -86,7 +86,7 @@ class RemoteAlgorithm:
         self._sender = Sender(child.memory_fd)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
-        child.left_s = math.inf
+        child.left_s = math.inf  # construction has a limit of its own
         answer = self._request("start", start, limits.loading_s)
         child.left_s = limits.total_s
         members = answer.get("members")
