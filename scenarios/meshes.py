@@ -76,7 +76,7 @@ def _face_normals(triangles: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.nda
     first, second, third = np.moveaxis(triangles, 1, 0)
     normals = np.cross(second - first, third - first)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    return np.asarray(np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0))
 
 
 def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], point: tuple[float, float]) -> Scene:

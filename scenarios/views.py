@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -120,8 +120,8 @@ def render_state(
 
 def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     """Build the scene for a viewpoint: ground, resolved rocks, texture and light."""
-    finest_m, half_width_m, lines = mesh_size(ground.surface.spacing_m, viewpoint.height_m, viewpoint.max_distance_m)
-    objects = select_rocks(ground.rocks, ground.site.photometry.rock_albedo, viewpoint, half_width_m)
+    mesh = mesh_size(ground.surface.spacing_m, viewpoint.height_m, viewpoint.max_distance_m)
+    objects = select_rocks(ground.rocks, ground.site.photometry.rock_albedo, viewpoint, mesh.half_width_m)
     is_near = viewpoint.height_m < _MAX_AMONG_ROCKS_M
     horizon = None
     if ground.site.hills and is_near:
@@ -140,15 +140,23 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         horizon=horizon,
         dust_albedo=ground.site.photometry.dust_albedo,
         dust_cover=ground.site.photometry.dust_cover,
-        mesh_finest_m=finest_m,
-        mesh_half_width_m=half_width_m,
-        mesh_lines=lines,
+        mesh_finest_m=mesh.finest_m,
+        mesh_half_width_m=mesh.half_width_m,
+        mesh_lines=mesh.lines,
         among_objects=is_near,
     )
 
 
-def mesh_size(spacing_m: float, height_m: float, max_distance_m: float = np.inf) -> tuple[float, float, int]:
-    """Return spacing at the centre, half width, m, and number of lines of the ground's mesh for a camera.
+class MeshSize(NamedTuple):
+    """Size of the ground's mesh: spacing at the centre and half width, m, and number of lines."""
+
+    finest_m: float
+    half_width_m: float
+    lines: int
+
+
+def mesh_size(spacing_m: float, height_m: float, max_distance_m: float = np.inf) -> MeshSize:
+    """Compute the size of the ground's mesh for a camera.
 
     - spacing_m: of the terrain's samples
     - height_m, max_distance_m: height of the camera above the ground, and largest distance of visible ground
@@ -159,7 +167,7 @@ def mesh_size(spacing_m: float, height_m: float, max_distance_m: float = np.inf)
     half_width_m = max(_MIN_HALF_WIDTH_RATIO * height_m, _MIN_HALF_WIDTH_M, min(horizon_m, max_distance_m))
     # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
     half_lines = int(np.ceil(np.arcsinh(half_width_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
-    return finest_m, half_width_m, 2 * half_lines + 1
+    return MeshSize(finest_m, half_width_m, 2 * half_lines + 1)
 
 
 def micro_relief(ground: SiteGround) -> MicroRelief:
