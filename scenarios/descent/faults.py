@@ -19,6 +19,11 @@ from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
+#: Faults of instruments, which have no effect on measurements without errors.
+INSTRUMENT_FAULTS = (
+    "exposure_delay_s", "shield_range_m", "altitude_error", "altitude_error_once", "attitude_error_deg",
+    "attitude_error_once_deg",
+)  # fmt: skip
 #: Index of the image that single-image faults affect; it belongs to both pairs.
 FAULTY_IMAGE = 1
 
