@@ -121,7 +121,7 @@ class FoundFailure:
 
     - case: number of the reduced case; original_case: number of the case before the reduction
     - margin: margin of the reduced case
-    - values: values of the dispersions that differ from the campaign's parameters, and of numbers `in-turn`, by path
+    - values: values of the dispersions that replace the campaign's parameters in the case, by path
     - distance: distance of these values from the medians, standard deviations; small distances are more likely
     - similar: number of violations with the same cause
     - repeated, repetitions: number of violations among the repetitions with new random streams and numbers `in-turn`
