@@ -61,15 +61,15 @@ def count_violations(
     violating_units = len(np.unique(unit_of_case[is_violation]))
     lower = float(beta.ppf(lower_risk, first_violations, units - first_violations + 1)) if first_violations else 0.0
     return CountingBound(
-        len(is_violation),
-        int(is_violation.sum()),
-        units,
-        violating_units,
-        first_violations,
-        lower,
-        _upper_bound(violating_units, units, upper_risk),
-        1.0 - lower_risk,
-        1.0 - upper_risk,
+        cases=len(is_violation),
+        violations=int(is_violation.sum()),
+        units=units,
+        violating_units=violating_units,
+        first_violations=first_violations,
+        lower=lower,
+        upper=_upper_bound(violating_units, units, upper_risk),
+        lower_confidence=1.0 - lower_risk,
+        upper_confidence=1.0 - upper_risk,
     )
 
 

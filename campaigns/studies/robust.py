@@ -131,6 +131,8 @@ def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVa
         raise CampaignError(f"{option}: {error}") from error
     if isinstance(assumed, bool) or not isinstance(assumed, int | float):
         raise CampaignError(f"{option}: its value in the campaign is {assumed!r}; allowed: parameters with a number")
+    if isinstance(assumed, int) and not float(farthest).is_integer():
+        raise CampaignError(f"{option}: its value in the campaign is {assumed}; allowed: whole numbers")
     if farthest == assumed:
         raise CampaignError(f"{option}: this is its value in the campaign; give the farthest value to be examined")
     values = [assumed + (farthest - assumed) * step / STEPS for step in range(1, STEPS + 1)]

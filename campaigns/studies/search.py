@@ -115,14 +115,14 @@ class SearchStudy:
         searched_cases = self._evaluated[:n_searched]  # all if the limit ended the search itself
         violation_numbers = [index + 1 for index, item in enumerate(searched_cases) if item.margin < 0.0]
         return SearchResult(
-            tuple(sorted(failures, key=lambda failure: failure.distance)),
-            len(searched_cases),
-            self.runner.n_cases,
-            len(violation_numbers),
-            min((item.margin for item in searched_cases), default=math.nan),
-            violation_numbers[0] if violation_numbers else None,
-            describe_margin(self._requirement),
-            reason,
+            failures=tuple(sorted(failures, key=lambda failure: failure.distance)),
+            search_cases=len(searched_cases),
+            cases=self.runner.n_cases,
+            violations=len(violation_numbers),
+            min_margin=min((item.margin for item in searched_cases), default=math.nan),
+            first_violation=violation_numbers[0] if violation_numbers else None,
+            margin_text=describe_margin(self._requirement),
+            reason=reason,
         )
 
     def _evaluate(self, points: Sequence[StudyPoint]) -> list[_EvaluatedPoint]:
@@ -165,8 +165,8 @@ class SearchStudy:
                 {
                     "seed": self._seed(f"strategy {number}"),
                     "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
-                    "verbose": -9,
-                    "verb_log": 0,
+                    "verbose": -9,  # no output
+                    "verb_log": 0,  # no log files
                     # margins are noisy, and equal margins are usual
                     "tolfun": 0.0,
                     "tolfunhist": 0.0,
@@ -222,15 +222,15 @@ class SearchStudy:
             repetitions = self._evaluate([repetition] * self.parameters.repetitions)
             failures.append(
                 FoundFailure(
-                    reduction.case,
-                    first.case,
-                    reduction.margin,
-                    self._changed_values(reduction.point),
-                    float(np.linalg.norm(cause.coordinates)),
-                    int(has_same_cause.sum()),
-                    sum(item.margin < 0.0 for item in repetitions),
-                    len(repetitions),
-                    reduction.outcome,
+                    case=reduction.case,
+                    original_case=first.case,
+                    margin=reduction.margin,
+                    values=self._changed_values(reduction.point),
+                    distance=float(np.linalg.norm(cause.coordinates)),
+                    similar=int(has_same_cause.sum()),
+                    repeated=sum(item.margin < 0.0 for item in repetitions),
+                    repetitions=len(repetitions),
+                    outcome=reduction.outcome,
                 )
             )
 

@@ -142,7 +142,7 @@ class TailFunction:
 def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex128[np.ndarray, "*batch"]:
     """Raise to a positive power by repeated squaring, which is much faster than the power of complex numbers."""
     result = values
-    for digit in bin(exponent)[3:]:
+    for digit in f"{exponent:b}"[1:]:  # the binary digits after the first
         result = result * result * values if digit == "1" else result * result
     return np.asarray(result)
 
@@ -227,6 +227,8 @@ def _max_rate(sizes: Sizes, statistic: int, risk: float) -> float:
             break
         # the rate with this p-value for the same pair; the least favourable pair there has a larger p-value
         rate = _solve_rate(tail, pair, rate, risk)
+        if rate == 1.0:
+            break
     return rate
 
 
@@ -240,8 +242,10 @@ def _solve_rate(tail: TailFunction, pair: Pair, rate: float, risk: float) -> flo
 
     start = float(special.logit(rate))
     stop = start + 1.0
-    while log_ratio(stop) > 0.0:
+    while special.expit(stop) < 1.0 and log_ratio(stop) > 0.0:
         stop += 1.0
+    if special.expit(stop) == 1.0:  # the rounding errors of the tail exceed the risk
+        return 1.0
     if log_ratio(start) <= 0.0:  # by rounding
         return rate
     return float(special.expit(optimize.brentq(log_ratio, start, stop, xtol=_TOLERANCE)))

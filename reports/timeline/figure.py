@@ -54,6 +54,7 @@ def draw_timeline(timeline: Timeline) -> Figure:
 
 
 def _rgb(name: str) -> tuple[float, float, float]:
+    """Return the colour of a path or of points for Matplotlib, 0 to 1."""
     red, green, blue = (value / 255.0 for value in colour(name))
     return red, green, blue
 

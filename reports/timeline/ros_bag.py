@@ -136,6 +136,7 @@ class _BagWriter:
         yield self._transform(header.frame_id, *pose)
 
     def _pose(self, topic: str, time_s: float, position: np.ndarray, quaternion: np.ndarray) -> tuple[int, str, Any]:
+        """Return stamp, topic and message of a pose in the world."""
         stamp, header = self._header(time_s, _WORLD)
         pose = self._type("geometry_msgs/msg/Pose")(
             position=self._type("geometry_msgs/msg/Point")(*position.tolist()), orientation=self._quaternion(quaternion)
@@ -145,7 +146,7 @@ class _BagWriter:
     def _transform(
         self, frame: str, time_s: float, position: np.ndarray, quaternion: np.ndarray
     ) -> tuple[int, str, Any]:
-        """Return the pose of a frame in the world as a transform for `/tf`."""
+        """Return stamp, topic and message of the pose of a frame in the world, as a transform for `/tf`."""
         stamp, header = self._header(time_s, _WORLD)
         transform = self._type("geometry_msgs/msg/Transform")(
             translation=self._type("geometry_msgs/msg/Vector3")(*position.tolist()),

@@ -267,6 +267,7 @@ def test_changed_rows_of_a_study_are_found(run: Path) -> None:
     [
         (("--parameter", "loads.0=3"), "is dispersed, so that the stored cases give its robustness"),
         (("--parameter", "betta=1"), "there is no parameter 'betta'"),
+        (("--parameter", "terrain=2.5"), "its value in the campaign is -1; allowed: whole numbers"),
         (("--parameter", "step=1"), "is False; allowed: parameters with a number"),
         (("--parameter", f"beta={BETA}"), "this is its value in the campaign"),
         (("--parameter", "beta=1", "-n", "20"), "--cases 20: at least 60"),
