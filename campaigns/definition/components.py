@@ -26,7 +26,7 @@ def list_algorithms(definition: CampaignDefinition) -> tuple[str, ...]:
     return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
 
 
-def own_limits(definition: CampaignDefinition) -> tuple[float, float]:
+def algorithm_process_limits(definition: CampaignDefinition) -> tuple[float, float]:
     """Return the time (s) and memory (bytes) that the algorithms in processes of their own may use for one case."""
     selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):

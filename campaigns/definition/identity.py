@@ -34,6 +34,7 @@ _CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")
 _KEYS_WITHOUT_EFFECT = frozenset(
     {"appended", "calibration", "description", "limits", "max_cases", "requirements", "retain"}
 )
+#: Folder of the program, with `_CODE_FOLDERS`.
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 
