@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.stats import beta
 
-#: Maximum number of units that a study can need.
-_MAX_UNITS = 10**9
+from marsyard.campaigns.definition.campaign_file import MAX_CASES
+
+#: Maximum number of units: that of the cases of a campaign.
+MAX_UNITS = MAX_CASES
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,12 @@ def count_violations(
 
 
 def find_units_needed(violating_units: int, max_probability: float, upper_risk: float) -> int:
-    """Find the number of units whose upper bound is at most the limit, for a number of units with a violation."""
+    """Find the number of units whose upper bound is at most the limit, for a number of units with a violation.
+
+    `MAX_UNITS` if fewer are not sufficient.
+    """
     return bisect.bisect_left(
-        range(_MAX_UNITS), True, key=lambda units: _upper_bound(violating_units, units, upper_risk) <= max_probability
+        range(MAX_UNITS), True, key=lambda units: _upper_bound(violating_units, units, upper_risk) <= max_probability
     )
 
 

@@ -66,7 +66,8 @@ def largest_statistic(sizes: Sizes) -> int:
     return sum(terrains * int(scores[cases]) for cases, terrains in sizes)
 
 
-#: Factor of suppression of unresolved coefficients of a generating function; the rounding error is 1e-16 / this.
+#: Factor of suppression of unresolved coefficients of a generating function: the absolute error of a probability.
+#: Rounding errors of 1e-16 are divided by the square root of this factor.
 _ALIASING = 1e-10
 
 
