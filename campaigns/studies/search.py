@@ -157,23 +157,21 @@ class SearchStudy:
 
     def _evolve(self) -> None:
         """Run evolution strategies in parallel until the cases are used."""
-        parameters, starts = self.parameters, self._select_starts()
+        parameters = self.parameters
+        options = {
+            "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
+            "verbose": -9,  # no output
+            "verb_log": 0,  # no log files
+            # margins are noisy, and equal margins are usual
+            "tolfun": 0.0,
+            "tolfunhist": 0.0,
+            "tolflatfitness": 10**6,
+        }
+        if len(self.campaign.drawn_paths) == 1:
+            options["maxstd_boundrange"] = math.inf  # `cma` raises an exception at this limit in one dimension
         strategies = [
-            cma.CMAEvolutionStrategy(
-                list(start),
-                _STEP,
-                {
-                    "seed": self._seed(f"strategy {number}"),
-                    "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
-                    "verbose": -9,  # no output
-                    "verb_log": 0,  # no log files
-                    # margins are noisy, and equal margins are usual
-                    "tolfun": 0.0,
-                    "tolfunhist": 0.0,
-                    "tolflatfitness": 10**6,
-                },
-            )
-            for number, start in enumerate(starts)
+            cma.CMAEvolutionStrategy(list(start), _STEP, {"seed": self._seed(f"strategy {number}"), **options})
+            for number, start in enumerate(self._select_starts())
         ]
         size = strategies[0].popsize
         while self.runner.n_cases + size * len(strategies) <= parameters.cases:
