@@ -54,7 +54,10 @@ INVALID = {
         ("altitude_m = {distribution='uniform', low=nan, high=1}", "altitude_m.low: input should be a finite number"),
         ("altitude_m = {distribution='uniform', low=true, high=1}", "altitude_m.low: input should be a valid number"),
         ("altitude_m = {distribution='normal', mean=5, sd=0}", "altitude_m.sd: input should be greater than 0"),
-        ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}", "the first limit must be below"),
+        (
+            "altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}",
+            "truncate = [9.0, 8.0]: the first limit must be below",
+        ),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[90,95]}", "no probability between the limits"),
         ("altitude_m = {distribution='normal', mean=500, sd=100}", "which is not valid: altitude_m"),
         ("altitude_m = {distribution='cauchy', loc=2000}", "which is not valid"),
