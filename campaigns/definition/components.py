@@ -46,6 +46,7 @@ def list_parts(definition: CampaignDefinition) -> tuple[str, ...]:
         return ()
     parameter_trees = [definition.parameters]
     for path, dispersion in definition.dispersions.items():
+        # the value of the dispersion is a part, or a table that contains one
         if any(f"{key}.".startswith(f"{path}.") for key in selected_scenario.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):

@@ -87,9 +87,8 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise StoreError(f"{path} cannot be opened: {error}") from error
         execute = self._connection.execute
         try:
-            (application,), (version,) = (
-                execute(f"PRAGMA {key}").fetchone() for key in ("application_id", "user_version")
-            )
+            (application,) = execute("PRAGMA application_id").fetchone()
+            (version,) = execute("PRAGMA user_version").fetchone()
             if application != _APPLICATION_ID:
                 raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:

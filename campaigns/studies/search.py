@@ -268,16 +268,16 @@ class SearchStudy:
         for index, path in enumerate(self.campaign.drawn_paths):
             if path in failure.point.nominal:
                 continue
-            low, high = 0.0, failure.point.coordinates[index]
+            inner, outer = 0.0, failure.point.coordinates[index]  # the median, and a violation
             for _ in range(_BISECTION_STEPS):
-                middle = 0.5 * (low + high)
+                middle = 0.5 * (inner + outer)
                 coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
                 (trial,) = self._evaluate([StudyPoint(tuple(coordinates), failure.point.stream, failure.point.nominal)])
                 if trial.margin < 0.0:
-                    failure, high = trial, middle
+                    failure, outer = trial, middle
                 else:
-                    low = middle
+                    inner = middle
         return failure
 
 

@@ -151,7 +151,7 @@ def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex12
 #: Relative positions of two support points: of the lower one between 0 and the mean, of the other between mean and 1.
 Pair = tuple[float, float]
 
-#: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
+#: Maximum number of values of one batch of distributions, and limits of the number of positions of a support point.
 _MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
 #: Range of the logits of support points in the search, number of its refinements, and of refined local maxima.
 _MAX_LOGIT, _REFINEMENTS, _MAX_STARTS = 7.0, 4, 4
@@ -278,22 +278,22 @@ def _find_supremum(sizes: Sizes, statistic: int, rate: float, sufficient: float 
     tail = TailFunction(sizes, statistic)
     grid = min(_MAX_GRID, max(_MIN_GRID, math.isqrt(_MAX_BATCH // tail.nodes.size)))
     # most points are close to 0, to the mean, and to 1
-    logits = special.expit(np.linspace(-_MAX_LOGIT, _MAX_LOGIT, grid))
-    x, y = np.concatenate([[0.0], logits, [1.0]]), np.append(logits, 1.0)
-    probabilities = tail.of_pairs(*_support(x, y, rate), rate)
+    positions = special.expit(np.linspace(-_MAX_LOGIT, _MAX_LOGIT, grid))
+    low, high = np.concatenate([[0.0], positions, [1.0]]), np.append(positions, 1.0)
+    probabilities = tail.of_pairs(*_support(low, high, rate), rate)
     is_maximum = probabilities == ndimage.maximum_filter(probabilities, 3, mode="nearest")
     starts = np.argwhere(is_maximum)
     order = np.argsort(-probabilities[tuple(starts.T)], kind="stable")[:_MAX_STARTS]
     row, column = starts[order[0]]
     if probabilities[row, column] > sufficient:
-        return min(float(probabilities[row, column]), 1.0), (float(x[row]), float(y[column]))
-    probability, pair = max(_refine(tail, rate, (x, y), (int(row), int(column))) for row, column in starts[order])
+        return min(float(probabilities[row, column]), 1.0), (float(low[row]), float(high[column]))
+    probability, pair = max(_refine(tail, rate, (low, high), (int(row), int(column))) for row, column in starts[order])
     return min(probability, 1.0), pair
 
 
-def _support(x: np.ndarray, y: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute support points below and above the mean from their relative positions between 0, the mean and 1."""
-    return x * rate, rate + y * (1.0 - rate)
+def _support(low: np.ndarray, high: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute support points below and above the mean `rate` from their relative positions (see `Pair`)."""
+    return low * rate, rate + high * (1.0 - rate)
 
 
 def _refine(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -147,8 +148,8 @@ def _log_series(recording: rr.RecordingStream, timeline: Timeline) -> None:
             }
     for entity, (times_s, values) in columns.items():
         is_finite = np.isfinite(values)
-        index = rr.TimeColumn(_TIME, duration=times_s[is_finite])
-        recording.send_columns(entity, [index], rr.Scalars.columns(scalars=values[is_finite]))
+        times = rr.TimeColumn(_TIME, duration=times_s[is_finite])
+        recording.send_columns(entity, [times], rr.Scalars.columns(scalars=values[is_finite]))
 
 
 def _create_blueprint(timeline: Timeline) -> rrb.Blueprint:
@@ -162,7 +163,7 @@ def _create_blueprint(timeline: Timeline) -> rrb.Blueprint:
     plots = [rrb.TimeSeriesView(origin=_entity("series", name), name=name) for name in timeline.series]
     if timeline.inertial is not None:
         plots += [rrb.TimeSeriesView(origin="inertial", name="inertial unit")]
-    right = [rrb.Tabs(*images)] if len(images) > 1 else list(images)
+    right: list[Any] = [rrb.Tabs(*images)] if len(images) > 1 else list(images)
     right += [rrb.Tabs(*plots)] if plots else []
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*space), rrb.Vertical(*right), column_shares=[3, 2]), collapse_panels=True
