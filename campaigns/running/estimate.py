@@ -74,7 +74,10 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
     retain = definition.retain
     # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
     stored_cases = {
-        "none": 0, "all": total, "failed": total, "worst": retain.worst,
+        "none": 0,
+        "all": total,
+        "failed": total,
+        "worst": retain.worst,
         "every": math.ceil(total / retain.every),
     }
     products = min(total, stored_cases[retain.products] + int(retain.showcase != "none")) * product_bytes

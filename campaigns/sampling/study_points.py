@@ -47,8 +47,8 @@ class StudyPoint:
     def read(cls, text: str) -> Self:
         """Read a point from its text. Raises ValueError for any other text."""
         try:
-            coordinates, stream, nominal, removed, *rest = json.loads(text)
-            blend, values, *_ = (*rest, [], [])  # `text` omits them if they are empty
+            coordinates, stream, nominal, removed, *present = json.loads(text)
+            blend, values = [*present, [], []][:2]  # `text` omits them if they are empty
             return cls(
                 tuple(map(float, coordinates)),
                 int(stream),
