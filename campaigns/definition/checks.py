@@ -198,7 +198,11 @@ def find_unknown_columns(
     numbers: Sequence[str],
     is_known: Callable[[str, str], bool],
 ) -> list[tuple[Key, str]]:
-    """List columns of requirements with an unknown name or kind: keys, and messages with the allowed columns."""
+    """List columns of requirements with an unknown name or kind: keys, and messages with the allowed columns.
+
+    - flags, numbers: names of the known columns of each kind, for the messages
+    - is_known: whether a column with this name has this kind (`FLAGS` or `NUMBERS`)
+    """
     problems: list[tuple[Key, str]] = []
     for index, requirement in enumerate(requirements):
         kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)

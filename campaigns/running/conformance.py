@@ -41,6 +41,7 @@ def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[F
     limits = WorkLimits(2.0 * subject.limit_s + _MARGIN_S, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
         for number, (name, requirement) in enumerate(candidates.check_names(subject)):
+            # one batch with one result
             ((result,),) = workers.run(
                 Work(partial(candidates.run_check, subject), [number], limits, load=partial(_load_subject, subject))
             )

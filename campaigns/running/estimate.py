@@ -64,6 +64,7 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
                 break
             build_times += _build_inputs(campaign, executor, plan, case)
             case_start_s = time.monotonic()
+            # one batch with one case
             ((completed,),) = run_cases(executor, definition, [case], selection=ALL_PRODUCTS)
             trials.append(completed)
             times.append(time.monotonic() - case_start_s)

@@ -138,14 +138,14 @@ def find_crossing(sizes: Changes, rates: WeightedRates, limit: float, *, decides
     if not count:
         return Crossing(math.nan, math.nan, math.nan, 0.0, float(rates.effective_units[0]))
     reach = float(sizes[count - 1])
+    decisive = rates.estimate if decides_by_rate else rates.upper
     lower, change, upper = (
-        _first_above(sizes[:count], values[:count], limit)
-        for values in (rates.estimate if decides_by_rate else rates.upper, rates.estimate, rates.lower)
+        _first_above(sizes[:count], values[:count], limit) for values in (decisive, rates.estimate, rates.lower)
     )
-    if math.isnan(lower):
-        lower = reach
-    elif lower == 0.0:
+    if decisive[0] > limit + _ROUNDING:
         lower = math.nan
+    elif math.isnan(lower):
+        lower = reach
     size = reach if math.isnan(change) else change
     return Crossing(change, lower, upper, reach, float(np.interp(size, sizes, rates.effective_units)))
 

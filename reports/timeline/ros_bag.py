@@ -80,7 +80,7 @@ class _BagWriter:
             rows = zip(data.times_s, data.rates_rad_s, data.specific_forces_m_s2, strict=True)
             for time_s, rate, force in rows:
                 stamp, header = self._header(float(time_s), _BODY)
-                unknown = np.array([-1.0, *np.zeros(8)])  # no attitude is measured
+                unknown = np.array([-1.0, *np.zeros(8)])  # ROS's sign that no attitude is measured
                 message = self._type("sensor_msgs/msg/Imu")(
                     header=header,
                     orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
