@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from html import escape
+from typing import NamedTuple
 
 
 class ElementKind(StrEnum):
@@ -60,15 +61,23 @@ def defeater(text: str, evidence: str = "", state: GoalState = GoalState.CHALLEN
     return Element(ElementKind.DEFEATER, text, evidence=evidence, own_state=state)
 
 
-def number_elements(root: Element) -> list[tuple[str, Element, str]]:
-    """List the elements in the order of the argument with their identifiers, and those of their parents."""
+class NumberedElement(NamedTuple):
+    """An element with its identifier (`G1`, for example) and that of its parent; empty for the root."""
+
+    name: str
+    element: Element
+    parent: str
+
+
+def number_elements(root: Element) -> list[NumberedElement]:
+    """List the elements in the order of the argument with their identifiers."""
     numbers = dict.fromkeys(ElementKind, 0)
-    listed: list[tuple[str, Element, str]] = []
+    listed: list[NumberedElement] = []
 
     def visit(element: Element, parent: str) -> None:
         numbers[element.kind] += 1
         name = f"{element.kind}{numbers[element.kind]}"
-        listed.append((name, element, parent))
+        listed.append(NumberedElement(name, element, parent))
         for child in element.children:
             visit(child, name)
 
@@ -129,7 +138,7 @@ class _Box:
 
 def draw_argument(root: Element) -> str:
     """Draw the argument as an SVG document."""
-    box = _place(root, 0, _PAD, iter([name for name, _, _ in number_elements(root)]))
+    box = _place(root, 0, _PAD, iter([item.name for item in number_elements(root)]))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD
     height = max(item.top + item.height for item in boxes) + _PAD

@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.claims import Confirmation
-from marsyard.reports.assurance.argument import Element, ElementKind, GoalState, defeater, goal, number_elements
+from marsyard.reports.assurance.argument import (
+    Element,
+    ElementKind,
+    GoalState,
+    NumberedElement,
+    defeater,
+    goal,
+    number_elements,
+)
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.provenance import format_tested_algorithms
 from marsyard.reports.report_file import CampaignReport
@@ -101,9 +109,9 @@ class AssuranceCase:
     factors: tuple[Mapping[str, str], ...] = field(default=())
 
     @property
-    def defeaters(self) -> list[tuple[str, Element, str]]:
-        """Open defeaters with their identifiers, and those of the elements that they challenge."""
-        return [item for item in number_elements(self.root) if item[1].kind is ElementKind.DEFEATER]
+    def defeaters(self) -> list[NumberedElement]:
+        """Open defeaters; their parents are the elements that they challenge."""
+        return [item for item in number_elements(self.root) if item.element.kind is ElementKind.DEFEATER]
 
     def to_json(self) -> dict[str, Any]:
         """Convert to JSON: elements, and links in the words of GSN."""
