@@ -73,7 +73,7 @@ def parse_record(path: Path, content: bytes) -> ConfirmationRecord:
             if kind is None:
                 _add_former_entry(entries, stored)
                 continue
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError(f"{location} is not an entry of a record of confirmations") from error
         if stored.get("previous") != head:
             raise StoreError(f"{location}: the chain of hashes is broken: an earlier entry was changed or removed")

@@ -115,7 +115,7 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
         text = (directory / REPORT_JSON).read_text(encoding="utf-8")
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
         data = table(json.loads(text))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{directory} cannot be read: {error}") from error
     report = read_report(text)
     if report is None:
