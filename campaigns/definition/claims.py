@@ -88,7 +88,9 @@ class FrozenAlgorithm:
 class Confirmation:
     """A confirmation in the record of confirmations.
 
-    - claim: identity of its content (`FrozenAlgorithm.claim`)
+    - campaign, folder: name of its campaign, and of the folder of the run
+    - frozen, claim: its content, and the identity of this content (`FrozenAlgorithm.claim`)
+    - started_utc, git_commit: time and commit of its start
     - number: number of the confirmation of its claim, from 1
     - seed, bank_seeds: seed of the draws, and seeds of the terrain banks by parameter path
     - cases: number of cases that it has announced, with appended ones

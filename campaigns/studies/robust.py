@@ -144,7 +144,11 @@ def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVa
 
 
 def _check_values(campaign: Campaign, variant: RobustVariant) -> None:
-    """Raise CampaignError if the scenario rejects the values of a variant."""
+    """Raise CampaignError if the scenario rejects the values of a variant, or sampled tables would replace them."""
+    for path in variant.values:
+        table = next((name for name in campaign.definition.dispersions if path.startswith(f"{name}.")), None)
+        if table is not None:
+            raise CampaignError(f"{variant.name}: its table '{table}' is dispersed as a whole")
     try:
         campaign.with_values(variant.values)
     except (ValidationError, ValueError, KeyError) as error:

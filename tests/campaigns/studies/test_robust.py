@@ -285,6 +285,17 @@ def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[st
     assert not (finished_run / "robust").exists()
 
 
+def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
+    lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
+    table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'
+    lines.insert(lines.index("[dispersions]") + 1, table)
+    (tmp_path / "campaign.toml").write_text("\n".join(lines))
+    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
+    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    with pytest.raises(CampaignError, match=r"loads\.0 = .*: its table 'loads' is dispersed as a whole"):
+        study(tmp_path / "run", {"loads.0": 3.0})
+
+
 def test_invalid_value_of_a_variant_is_rejected(run: Path) -> None:
     variant = SystemVariant(name="invalid", title="a number as name", values={"kind": 5}, source="test")
     with pytest.raises(CampaignError, match="invalid: Input should be a valid string"):
