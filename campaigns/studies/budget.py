@@ -91,14 +91,20 @@ def _cases_per_sample(variables: int) -> int:
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:
     """Return the sources of error that act in the campaign, and the titles of the other sources.
 
-    A source acts if one of its parameters is dispersed, or differs from its value without the error.
+    A source acts if one of its parameters is dispersed, alone or in a table, or differs from its value without the
+    error.
     """
-    parameters, dispersed = campaign.definition.parameters, campaign.definition.dispersions
+    parameters = campaign.definition.parameters
+
+    def is_dispersed(path: str) -> bool:
+        pairs = ((f"{path}.", f"{name}.") for name in campaign.definition.dispersions)
+        return any(own.startswith(other) or other.startswith(own) for own, other in pairs)
+
     active: list[ScenarioSource] = []
     inactive: list[str] = []
     for source in error_sources(campaign.definition.scenario):
         exact = source.exact_values(parameters)
-        is_active = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
+        is_active = any(is_dispersed(path) or value_at(parameters, path) != value for path, value in exact.items())
         if is_active:
             active.append(source)
         else:

@@ -162,6 +162,12 @@ def test_each_system_has_requirements_with_margins_and_error_sources(system: str
     assert n_with_margin >= 1
 
 
+@pytest.mark.parametrize(("name", "sources"), [("dimes-offnominal", {"optics", "clouds"}), ("hda-limits", {"motion"})])
+def test_error_source_in_a_dispersed_table_is_active(name: str, sources: set[str]) -> None:
+    """The table (`faults`, `image_poses`) is drawn as a whole; in the campaign's parameters the source does not act."""
+    assert sources <= {source.name for source in active_sources(load_campaign(name))[0]}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
