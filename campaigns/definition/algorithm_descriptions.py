@@ -7,9 +7,8 @@ from typing import Any
 
 from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.components import list_algorithms
+from marsyard.campaigns.definition.components import list_algorithms, list_compared_algorithms
 from marsyard.campaigns.definition.identity import custom_sources, distribution_version, hash_sources
-from marsyard.campaigns.definition.parameter_paths import find_value
 from marsyard.scenarios.custom_algorithms import custom_path, describe_custom
 from marsyard.scenarios.imports import source_files
 from marsyard.scenarios.interface import HasAlgorithms
@@ -29,7 +28,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     if not isinstance(selected_scenario, HasAlgorithms):
         return []
     task = selected_scenario.task
-    compared = find_value(campaign.definition.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
+    compared = list_compared_algorithms(campaign.definition)
     table: Any = campaign.base_parameters()
     for name in selected_scenario.algorithm_table:
         table = getattr(table, name)

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
-from marsyard.campaigns.definition.parameter_paths import value_at
+from marsyard.campaigns.definition.parameter_paths import paths_overlap, value_at
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
@@ -97,8 +97,7 @@ def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tupl
     parameters = campaign.definition.parameters
 
     def is_dispersed(path: str) -> bool:
-        pairs = ((f"{path}.", f"{name}.") for name in campaign.definition.dispersions)
-        return any(own.startswith(other) or other.startswith(own) for own, other in pairs)
+        return any(paths_overlap(path, name) for name in campaign.definition.dispersions)
 
     active: list[ScenarioSource] = []
     inactive: list[str] = []

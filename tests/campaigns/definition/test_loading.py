@@ -9,6 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.components import list_algorithms
 from marsyard.campaigns.definition.identity import hash_code
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
@@ -313,3 +315,20 @@ def test_hash_of_the_code_includes_the_shaders(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("marsyard.campaigns.definition.identity.hash_sources", lambda sources: sorted(dict(sources)))
     names = hash_code.__wrapped__(())
     assert {"sim/render/pinhole.py", "sim/render/shaders/segmentation.vert"} <= set(names)
+
+
+@pytest.mark.parametrize(
+    ("campaign", "path", "value"),
+    [
+        ("dimes-smoke", "algorithm", "custom:Estimator"),
+        ("dimes-smoke", "compared", ["custom:Estimator"]),
+        ("dimes-smoke", "compared.0", "custom:Estimator"),
+        ("vtt-sideways", "drive", {"algorithm": "custom:Estimator"}),
+        ("vtt-sideways", "drive", {"compared": ["custom:Estimator"]}),
+    ],
+)
+def test_algorithms_in_dispersions_are_listed(campaign: str, path: str, value: object) -> None:
+    """Otherwise the code of a folder from elsewhere would be executed without --trust, and would have no hash."""
+    tables = load_campaign(campaign).definition.model_dump(mode="json")
+    tables |= {"correlations": [], "dispersions": {path: {"distribution": "choice", "values": [value]}}}
+    assert list_algorithms(CampaignDefinition.model_validate(tables))[-1] == "custom:Estimator"
