@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.claims import bank_seeds
 from marsyard.campaigns.definition.components import list_algorithms
 from marsyard.campaigns.definition.identity import hash_code
 from marsyard.campaigns.definition.loading import load_campaign
@@ -332,3 +333,14 @@ def test_algorithms_in_dispersions_are_listed(campaign: str, path: str, value: o
     tables = load_campaign(campaign).definition.model_dump(mode="json")
     tables |= {"correlations": [], "dispersions": {path: {"distribution": "choice", "values": [value]}}}
     assert list_algorithms(CampaignDefinition.model_validate(tables))[-1] == "custom:Estimator"
+
+
+@pytest.mark.parametrize("path", ["location.bank_seed", "location"])
+def test_dispersed_seed_of_a_terrain_bank_is_not_derived(path: str) -> None:
+    """The command of a confirmation sets derived seeds, which removes their dispersions."""
+    definition = load_campaign("dimes-smoke").definition
+    assert set(bank_seeds(definition)) == {"location.bank_seed"}
+    value = {"bank_seed": 5} if path == "location" else 5
+    tables = definition.model_dump(mode="json")
+    tables |= {"correlations": [], "dispersions": {path: {"distribution": "fixed", "value": value}}}
+    assert bank_seeds(CampaignDefinition.model_validate(tables)) == {}
