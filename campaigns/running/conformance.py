@@ -18,7 +18,7 @@ _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 _MARGIN_S = 5.0
 
 
-def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.CandidateAlgorithm:
+def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Subject:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
     - task: task of the algorithm; None for the task that its interface determines
@@ -33,14 +33,14 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Ca
         candidates.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return candidates.CandidateAlgorithm(spec, task_name, limit_s)
+    return candidates.Subject(spec, task_name, limit_s)
 
 
-def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[Finding]:
+def run_conformance_checks(subject: candidates.Subject) -> Iterator[Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
     limits = WorkLimits(2.0 * subject.limit_s + _MARGIN_S, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
-        for number, (name, requirement) in enumerate(candidates.check_names(subject)):
+        for number, (name, requirement) in enumerate(candidates.list_checks(subject)):
             # one batch with one result
             ((result,),) = workers.run(
                 Work(partial(candidates.run_check, subject), [number], limits, load=partial(_load_subject, subject))
@@ -64,7 +64,7 @@ def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[F
                 return
 
 
-def _load_subject(subject: candidates.CandidateAlgorithm) -> None:
+def _load_subject(subject: candidates.Subject) -> None:
     """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()
