@@ -24,7 +24,7 @@ from marsyard.reports.robustness import ChangeOutcome, Robustness
 from marsyard.reports.robustness_evaluation import select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.reweighted_rates import find_crossing, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import ROUNDING, find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.columns import split_unit
@@ -119,7 +119,7 @@ def _evaluate(
     permitted = 1.0 - verdict.probability
     status = Status.PASS if upper <= permitted else Status.FAIL if lower > permitted else Status.INSUFFICIENT
     if verdict.decide_by == ESTIMATE and status is not Status.PASS:
-        status = Status.MET_BY_RATE if estimate <= permitted else Status.FAIL
+        status = Status.MET_BY_RATE if estimate <= permitted + ROUNDING else Status.FAIL
     return VariantVerdict(
         variant=variant.name,
         title=variant.title,

@@ -107,7 +107,7 @@ def _sum_groups(
 
 
 #: Rounding error of a rate that is compared with a limit.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def find_crossing(sizes: Changes, rates: WeightedRates, limit: float, *, decides
     lower, change, upper = (
         _first_above(sizes[:count], values[:count], limit) for values in (decisive, rates.estimate, rates.lower)
     )
-    if decisive[0] > limit + _ROUNDING:
+    if decisive[0] > limit + ROUNDING:
         lower = math.nan
     elif math.isnan(lower):
         lower = reach
@@ -155,7 +155,7 @@ def _first_above(sizes: Changes, values: Changes, limit: float) -> float:
 
     The first size is 0, without a change.
     """
-    above = np.flatnonzero(values > limit + _ROUNDING)
+    above = np.flatnonzero(values > limit + ROUNDING)
     if not above.size:
         return math.nan
     first = int(above[0])

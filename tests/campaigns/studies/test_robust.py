@@ -36,7 +36,7 @@ from marsyard.reports.robustness import ChangeOutcome
 from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
-from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain import Site
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
@@ -163,6 +163,15 @@ def test_bounds_of_variants_allow_for_shared_terrains_and_repeated_looks() -> No
     assert result is not None
     assert result.upper == pytest.approx(exact.max_failure_rate(0.05), rel=1e-3)
     assert 0.0 < result.lower <= exact.min_failure_rate(0.03) * 1.001
+
+
+def test_variant_with_exactly_the_required_rate_is_met_by_rate() -> None:
+    """1 - 0.9 is a little less than 10 of 100."""
+    rows = pd.DataFrame({"case": np.arange(100), "outcome": "VALID", "answered": True, "ok": np.arange(100) >= 10})
+    verdict = Verdict("OK", "", "ok", math.nan, 0.9, 0.9, "all", decide_by=ESTIMATE)
+    result = _evaluate(RobustStudy([], rows, np.ones(100)), RobustVariant("v", "V", {}), rows, verdict)
+    assert result is not None
+    assert result.status is Status.MET_BY_RATE
 
 
 def test_steps_allow_for_shared_terrains() -> None:
