@@ -230,7 +230,8 @@ class Scene:
         if self.clouds is not None:
             cloud_light = self.clouds.parameters.sky_light(self.sun)
             photometry = replace(photometry, sky_fraction=photometry.sky_fraction + cloud_light)
-            clouds = self.clouds.at_time(self.sun, time_s)
+            # without direct sunlight clouds cast no shadows
+            clouds = self.clouds.at_time(self.sun, time_s) if self.sun.direction[2] > 0.0 else None
         # clouds are not rendered, so they do not change the brightness of the sky
         return Light(
             Array3f64(*self.sun.direction.tolist()),
