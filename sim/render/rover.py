@@ -77,12 +77,16 @@ def rover_objects(
     """
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
-    # the axis of a wheel is y
+    # the axis of a wheel is y; normals are stretched by the inverse of the size
     wheel = (_unit_wheel() * np.stack([size, 1.0 / size]))[..., [1, 2, 0]]
     wheel[:, :, 1] /= np.linalg.norm(wheel[:, :, 1], axis=2, keepdims=True)
-    parts = {"deck": [_build_deck(rover)], "body": [_build_body(rover, stance)]}
-    parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
-    parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
+    parts = {
+        "deck": [_build_deck(rover)],
+        "body": [_build_body(rover, stance)],
+        # only points are moved, not normals
+        "wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres],
+        "mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)],
+    }
     bodies = [
         _create_body(_transform(solid, stance.world_from_rover), ALBEDOS[material])
         for material, solids in parts.items()
