@@ -95,8 +95,10 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
 
 def _full_turns(heights: Raster, ortho: Raster, full_turn_m: float) -> int:
     """Return the number of full turns of longitude from the DTM's centre to that of its orthoimage."""
-    centres = (raster.west_m + 0.5 * raster.posting_m * raster.values.shape[1] for raster in (ortho, heights))
-    return round(float(next(centres) - next(centres)) / full_turn_m)
+    heights_m, ortho_m = (
+        raster.west_m + 0.5 * raster.posting_m * raster.values.shape[1] for raster in (heights, ortho)
+    )
+    return round(float(ortho_m - heights_m) / full_turn_m)
 
 
 def ortho_origin(source: RealTerrain, heights: Raster, ortho: Raster) -> tuple[float, float]:
@@ -243,8 +245,9 @@ def read_brightness(file: Any) -> Grid:
         brightness += _palette_luminance(file.colormap(1))[file.read(1)]
     else:
         is_colour = "red" in names
+        grey = next((number for number, name in enumerate(names, start=1) if name != "alpha"), 1)
         for number, name in zip(file.indexes, names, strict=True):
-            weight = LUMINANCE.get(name, 0.0) if is_colour else float(number == 1)
+            weight = LUMINANCE.get(name, 0.0) if is_colour else float(number == grey)
             if weight == 0.0:
                 continue
             band = file.read(number)
