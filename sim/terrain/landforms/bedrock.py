@@ -9,7 +9,7 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, expose_strata
+from marsyard.sim.terrain.landforms.kernels.bedrock import LOG_ALBEDO, Slabs, add_slabs, expose_strata
 from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 
 _ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.
@@ -98,7 +98,7 @@ class Outcrop(Parameters):
             self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
             for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
-        generations[0].slabs[..., 3] += self.log_albedo
+        generations[0].slabs[..., LOG_ALBEDO] += self.log_albedo
         fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
         edge = max(_DUSTY_EDGE * self.height_m, 1e-6)
         add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, _FRACTURED, edge)
@@ -106,6 +106,7 @@ class Outcrop(Parameters):
 
     def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
         """Draw the slabs of a generation with this size and height relative to the parameters."""
+        # a Voronoi cell needs neighbours on all sides
         cells = max(round(period_m / (size * self.slab_m)), 3)
         rise = _HEIGHT_RANGE * height * self.height_m
         slabs = np.stack(

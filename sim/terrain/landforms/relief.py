@@ -193,12 +193,13 @@ class Gullies(Parameters):
         # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
         cut_channels(layer.log_albedo, layer.spacing_m, trunks, 1.5)
         if self.tributaries and trunks.size:
-            mouths = rng.integers(0, trunks.shape[0], count * self.tributaries)
-            heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], mouths.size)
-            width = trunks[mouths, 2] * 2.0 * rng.uniform(0.35, 0.6, mouths.size)
+            mouths = trunks[rng.integers(0, len(trunks), count * self.tributaries)]
+            start, half_width, _ = np.split(mouths, [2, 3], axis=1)
+            heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], len(mouths))
+            width = half_width[:, 0] * 2.0 * rng.uniform(0.35, 0.6, len(mouths))
             length = 6.0 * width + 0.1 * self.length_m
             depth = width * self._compute_depth(1.0)
-            branches = draw_channels(trunks[mouths, :2], heading, length, width, depth, 0.15, rng)
+            branches = draw_channels(start, heading, length, width, depth, 0.15, rng)
             cut_channels(layer.log_albedo, layer.spacing_m, branches, 1.5)
         layer.height[...] = -layer.log_albedo
         layer.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._compute_depth(self.width_m)))
@@ -293,18 +294,18 @@ class Fans(Parameters):
             self._add_washes(ground, apexes, rng)
 
     def _add_washes(self, ground: TerrainGround, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
-        """Cut the washes of all fans."""
+        """Cut the washes of all fans; `apexes` has rows (x, y, radius)."""
         # until the channels are complete, the albedo grid of `layer` contains their depth
         layer = ground.coarser(self.wash_width_m / 3.0)
         count = self.washes_per_fan
-        for apex in apexes:
+        for x, y, radius in apexes:
             # on both sides of the divide, within 30 deg of the steepest descent
             heading = rng.choice([-1.0, 1.0], count) * np.pi / 2.0 + rng.uniform(-0.52, 0.52, count)
-            start_radius = apex[2] * rng.uniform(0.02, 0.5, count)
+            start_radius = radius * rng.uniform(0.02, 0.5, count)
             width = self.wash_width_m * np.exp(0.5 * rng.standard_normal(count))
             depth = self.wash_depth_m * np.exp(0.4 * rng.standard_normal(count))
-            start = apex[:2] + start_radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-            length = apex[2] * rng.uniform(0.9, 1.05, count) - start_radius
+            start = np.array([x, y]) + start_radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+            length = radius * rng.uniform(0.9, 1.05, count) - start_radius
             discs = draw_channels(start, heading, np.maximum(length, width), width, depth, 0.06, rng)
             cut_channels(layer.log_albedo, layer.spacing_m, discs, 2.0)
         layer.height[...] = -layer.log_albedo
