@@ -115,7 +115,8 @@ def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, fr
     else:
         model = _MODELS[type(camera).__name__.upper()]
     (hs, vs), (hc, vc), theta = camera.focal_lengths, camera.image_centre, camera.theta
-    lines = [f"# {line}".rstrip() for line in (*comment.splitlines(), *([f"Frame: {frame}"] if frame else []))]
+    remarks = [*comment.splitlines(), *(f"Frame: {frame}".splitlines() if frame else [])]
+    lines = [f"# {line}".rstrip() for line in remarks]
     lines += [f"Model = {model}", "", f"Dimensions = {camera.size[0]} {camera.size[1]}", ""]
     for letter in type(camera).__name__.upper():
         lines.append(f"{letter} = " + " ".join(repr(float(number)) for number in getattr(camera, letter.lower())))
