@@ -130,8 +130,8 @@ class Renderer:
         terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
         tree, light = scene.objects.hierarchy(numbers, position), scene.light(time_s)
         pose, extent = Pose.of(rotation, position), scene.extent
-        hits = trace_primary_rays(terrain, extent, views, pose, rays.device, tree, is_grazing)
-        image = shade_hits(scene, light, terrain, pose, rays.device, hits)
+        hits = trace_primary_rays(terrain, extent, views, pose, rays.device_rays, tree, is_grazing)
+        image = shade_hits(scene, light, terrain, pose, rays.device_rays, hits)
         radiance, body, range_m = to_host(image.radiance), to_host(image.body), to_host(hits.distance)
         columns, rows = rays.size
         size, side = (UInt32(columns), UInt32(rows)), scene.edge_rays
@@ -206,7 +206,7 @@ def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side:
     columns, rows = rays.size
     pixel = to_device(UInt32, np.repeat(pixels, side**2))
     ray_in_pixel = to_device(UInt32, np.tile(np.arange(side**2), len(pixels)))
-    return pixel, split_rays(rays.device, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
+    return pixel, split_rays(rays.device_rays, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
 
 
 def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:

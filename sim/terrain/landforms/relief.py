@@ -102,7 +102,7 @@ class Swell(Parameters):
         phase = 2.0 * np.pi * np.arange(layer.side) / layer.side
         field = np.zeros((layer.side, layer.side))
         for m, n in product(range(self.waves + 1), range(-self.waves, self.waves + 1)):
-            if (m, n) > (0, 0):
+            if (m, n) > (0, 0):  # a wave with the opposite wave vector is the same wave
                 strength = rng.uniform(0.7, 1.0) / (m * m + n * n) ** 1.25
                 shift = rng.uniform(0.0, 2.0 * np.pi)
                 field += strength * np.cos(m * phase[None, :] + n * phase[:, None] + shift)

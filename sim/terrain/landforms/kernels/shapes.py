@@ -262,23 +262,25 @@ def raise_cones(
     """
     side = height.shape[0]
     period = side * spacing
+    # height from which the coverage is 1: 2 % of the first cone's slope times radius
+    full_height = 0.02 * slope * apexes[0, 2]
     for i in range(side):
         for j in range(side):
             total = 0.0
             for n in range(apexes.shape[0]):
-                dx, dy = abs(j * spacing - apexes[n, 0]), abs(i * spacing - apexes[n, 1])
+                x, y, radius = apexes[n]
+                dx, dy = abs(j * spacing - x), abs(i * spacing - y)
                 dx, dy = min(dx, period - dx), min(dy, period - dy)
                 distance = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
-                remaining = 1.0 - distance / apexes[n, 2]
+                remaining = 1.0 - distance / radius
                 if remaining > 0.0:
-                    z = slope * apexes[n, 2] / concavity * remaining**concavity
+                    z = slope * radius / concavity * remaining**concavity
                     # smooth maximum of all cones: norm of order 8
                     total += z**8
             if total > 0.0:
                 z = total**0.125
                 height[i, j] += z
-                # the coverage is 1 from 2 % of the first cone's slope times radius
-                coverage[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
+                coverage[i, j] = min(z / full_height, 1.0)
 
 
 @njit(cache=True)
