@@ -1,4 +1,4 @@
-"""Compiled kernels of the terrain: evaluation of the cubic B-spline, upper height bounds, and coarser levels."""
+"""Compiled kernels of the terrain: evaluation, refinement and height bounds of the B-spline, and levels of samples."""
 
 import math
 
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 #: A level of the pyramid, shape (side, side, 2): height and albedo; side is a power of two.
 Level = NDArray[np.float32]
+#: Values of one quantity on a periodic grid, shape (side, side).
+Grid = NDArray[np.float32]
 Array = NDArray[np.float64]
 #: One number for each of four successive control values.
 Weights = tuple[float, float, float, float]
@@ -134,3 +136,37 @@ def reduce_level(fine: Level) -> Level:
                 for c in range(2):
                     coarse[i, j, c] += weights[k] * half_width[source, j, c]
     return coarse
+
+
+@njit(cache=True)
+def add_refined(fine: Grid, coarse: Grid) -> None:
+    """Upsample a coarse grid of cubic B-spline coefficients by two (exact subdivision), and add it to the fine grid."""
+    side = coarse.shape[0]
+    row = np.empty(side, dtype=np.float32)
+    one_eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
+    for i in range(2 * side):
+        k = i // 2
+        current = coarse[k]
+        following = coarse[(k + 1) % side]
+        if i % 2 == 0:
+            previous = coarse[k - 1]
+            for j in range(side):
+                row[j] = one_eighth * (previous[j] + following[j]) + six_eighths * current[j]
+        else:
+            for j in range(side):
+                row[j] = half * (current[j] + following[j])
+        fine_row = fine[i]
+        for j in range(side - 1):
+            fine_row[2 * j] += one_eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
+            fine_row[2 * j + 1] += half * (row[j] + row[j + 1])
+        fine_row[2 * side - 2] += one_eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
+        fine_row[2 * side - 1] += half * (row[side - 1] + row[0])
+
+
+@njit(cache=True)
+def interleave_samples(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
+    """Interleave height and albedo; the albedo is scaled and limited to 1."""
+    for i in range(height.shape[0]):
+        for j in range(height.shape[0]):
+            samples[i, j, 0] = height[i, j]
+            samples[i, j, 1] = min(scale * albedo[i, j], 1.0)

@@ -5,9 +5,9 @@ from jaxtyping import Float32
 
 from marsyard.sim.streams import substream
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
+from marsyard.sim.terrain.kernels import interleave_samples
 from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.ground import TerrainGround, refine
-from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
 from marsyard.sim.terrain.landforms.random_fields import FractalField
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import TerrainParameters

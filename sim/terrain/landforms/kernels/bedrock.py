@@ -7,8 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import Array
-from marsyard.sim.terrain.landforms.kernels.shapes import Grid
+from marsyard.sim.terrain.kernels import Array, Grid
 
 
 class NearestCells(NamedTuple):

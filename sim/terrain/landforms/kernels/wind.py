@@ -7,13 +7,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
+from marsyard.sim.terrain.kernels import Array, Grid, Level, bspline_weights, collapse
 
 #: Maximum strength of the modulation, whose RMS is 1, for the height of a crest (assumed).
 MAX_STRENGTH = 1.6
 #: Minimum and maximum fraction of the wavelength under the slip face.
 MIN_SLIP, MAX_SLIP = 0.01, 0.5
-Grid = NDArray[np.float32]
 GridRow = NDArray[np.float32]
 
 
