@@ -3,7 +3,13 @@
 Each side of the rover has a rocker and a bogie. The front wheel and the pivot of the bogie are mounted on the rocker,
 the middle and the rear wheel on the bogie. Rockers and bogies rotate about axes parallel to the body's y axis. A
 differential rotates the two rockers against the body by opposite angles: the body's pitch is the mean of their
-pitches. Wheels are unsteered cylinders with axles parallel to the y axis. There are no springs or joint limits.
+pitches. One side, with the front to the right::
+
+      bogie pivot ----- rocker pivot (on the body)
+       |       |              |
+     rear    middle         front
+
+Wheels are unsteered cylinders with axles parallel to the y axis. There are no springs or joint limits.
 
 For a position (east, north) and an azimuth there are six unknowns: height, pitch and roll of the body, and the angles
 of the differential and of both bogies. The six equations are that the gap between each wheel and the ground is zero.

@@ -116,7 +116,7 @@ class Scene:
         return set(self.__dict__) - {field.name for field in fields(self)}
 
     def _replace(self, *results: str, **changes: Any) -> Scene:
-        """Return a changed scene that has these cached results of this one, which remain valid."""
+        """Return a changed scene with these results of this one, which remain valid; missing results are computed."""
         scene = replace(self, **changes)
         scene.__dict__.update({name: getattr(self, name) for name in results})
         return scene
