@@ -118,6 +118,11 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
             f"{source.dtm} covers {width:g} m x {length:g} m; "
             f"it must be wider than twice the border ({source.border_m:g} m)"
         )
+    # the sample at the centre of the terrain is then inside the border
+    if min(width, length) <= spacing_m:
+        raise TerrainFileError(
+            f"{source.dtm} covers {width:g} m x {length:g} m; it must be wider than terrain.spacing_m, {spacing_m:g} m"
+        )
     heights, holes = fill_holes(raster.values)
     # align the DTM with the grid: posts coincide with samples if the posting is a multiple of the spacing
     west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))

@@ -178,6 +178,8 @@ def _create_raster(values: Any, posting_m: float, path: Path) -> Raster:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or min(array.shape) < 4:
         raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
+    if not 0.0 < posting_m < np.inf:
+        raise TerrainFileError(f"{path} has a distance of {posting_m:g} m between grid points; it must be positive")
     array = np.where(np.isfinite(array), array, np.nan)
     return Raster(array[::-1].copy(), posting_m, 0.5 * posting_m, (0.5 - array.shape[0]) * posting_m)
 
