@@ -31,7 +31,8 @@ class NearestCells(NamedTuple):
 def _find_cells(positions: Array, x: float, y: float) -> NearestCells:
     """Find the Voronoi cells next to x, y; `positions` are those of `add_cracks`."""
     row, column = int(y), int(x)
-    nearest2, second2, nearest, second = 1e9, 1e9, 0, 0
+    # squared distances, and numbers k of the points: those of the 3 x 3 squares around the position
+    nearest2, second2, nearest, second = math.inf, math.inf, 0, 0
     for k in range(9):
         dx, dy = positions[row + k // 3, column + k % 3, 0] - x, positions[row + k // 3, column + k % 3, 1] - y
         distance2 = dx * dx + dy * dy
