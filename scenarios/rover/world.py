@@ -67,6 +67,7 @@ class RunWorld:
     sun: MovingSunParameters
     target_number: int  #: index of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
+    #: index of an interval of the sun's position, and the scene in it
     _cached_scene: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
