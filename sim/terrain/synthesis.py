@@ -73,7 +73,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 def _add_fine_ground(
     ground: TerrainGround, fine: TerrainGround, factors: Float32[np.ndarray, "side side 3"], relief_log_albedo: float
 ) -> None:
-    """Add fine relief and albedo, scaled by the factors of the surface units.
+    """Add fine relief and albedo, scaled by the factors of the surface units, to the ground; changes both in place.
 
     With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``.
     The log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
