@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, UInt16
 
 from marsyard.scenarios import views
-from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.radiance import add_haze
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
+from marsyard.scenarios.visible_rocks import add_unresolved_rocks, smallest_rock_rad
 from marsyard.sim import sensor
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
@@ -159,7 +159,7 @@ def render_images(
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
     viewpoint = views.Viewpoint.from_pose(rays[0], pose, ground.surface)
     scene = _add_rover(views.site_scene(ground, viewpoint, sun), request, ground)
-    smallest_rad = views.smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
+    smallest_rad = smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(rendered_cameras):

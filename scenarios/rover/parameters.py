@@ -13,7 +13,7 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.terrain_files import site_validator
+from marsyard.scenarios.site_parameters import site_validator
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.driving import SlipParameters
 from marsyard.sim.error_sources import CLOUDS, DETECTOR, OPTICS, SHADOW, ErrorSource
