@@ -138,12 +138,12 @@ def comparison_section(subject: Subject) -> Section | None:
     results, differences = compare_algorithms(subject.frame, subject.metric, subject.bound)
     if not results:
         return None
-    grids = comparison_grids(results, differences, subject.metric)
+    result_grid, difference_grid = comparison_grids(results, differences, subject.metric)
     tested_name = results[0].name
     note = note_text("common.comparison", tested=tested_name, confidence=format_fraction(CONFIDENCE))
-    blocks = [Block(grid=grids[0])]
+    blocks = [Block(grid=result_grid)]
     if differences:
-        blocks.append(Block(heading=f"Against {tested_name}", grid=grids[1], note=note))
+        blocks.append(Block(heading=f"Against {tested_name}", grid=difference_grid, note=note))
     data = {"algorithms": results, "against": tested_name, "differences": differences}
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
 

@@ -30,7 +30,8 @@ from marsyard.cli.errors import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.nightly import History, MetricChange, NightCampaign, format_night_page, list_comparisons
+from marsyard.reports.night_history import History, MetricChange, NightCampaign
+from marsyard.reports.nightly import format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters
 
 #: The plan that is installed with Marsyard.
