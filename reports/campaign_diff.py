@@ -21,14 +21,8 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.decision import requirement_masks
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid
-from marsyard.reports.statistics.difference_tests import (
-    Metric,
-    Sample,
-    compare_successes,
-    correct_holm,
-    difference_p_value,
-    symmetry_p_value,
-)
+from marsyard.reports.statistics.difference_tests import Metric, Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.paired_tests import compare_successes, symmetry_p_value
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import NOTHING, label, number, p_text, percent
 

@@ -2,7 +2,7 @@
 
 Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by the cases in
 which only one algorithm succeeded, errors by the differences of the cases that both answered
-(`marsyard.reports.statistics.difference_tests`). All p-values are corrected by Holm's method.
+(`marsyard.reports.statistics.paired_tests`). All p-values are corrected by Holm's method.
 """
 
 import math
@@ -18,7 +18,8 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.populations import success_mask
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.statistics.difference_tests import compare_errors, compare_successes, correct_holm
+from marsyard.reports.statistics.difference_tests import correct_holm
+from marsyard.reports.statistics.paired_tests import compare_errors, compare_successes
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, p_text, percent
 from marsyard.scenarios.columns import split_unit
 

@@ -16,7 +16,7 @@ from typing import Any
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 
-#: Margin of a case whose boolean metric is false, although its margin column is not negative.
+#: Margin of a case whose boolean metric is false, although its margin column is not negative: the nearest violation.
 MAX_VIOLATION_MARGIN = -1e-12
 
 

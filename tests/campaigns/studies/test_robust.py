@@ -267,6 +267,7 @@ def test_changed_rows_of_a_study_are_found(run: Path) -> None:
     [
         (("--parameter", "loads.0=3"), "is dispersed, so that the stored cases give its robustness"),
         (("--parameter", "betta=1"), "there is no parameter 'betta'"),
+        (("--parameter", "terrain=2.5"), "its value in the campaign is -1; allowed: whole numbers"),
         (("--parameter", "step=1"), "is False; allowed: parameters with a number"),
         (("--parameter", f"beta={BETA}"), "this is its value in the campaign"),
         (("--parameter", "beta=1", "-n", "20"), "--cases 20: at least 60"),
@@ -282,6 +283,17 @@ def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[st
     result = CliRunner().invoke(app, ["robust", str(finished_run), *arguments])
     assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
     assert not (finished_run / "robust").exists()
+
+
+def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
+    lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
+    table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'
+    lines.insert(lines.index("[dispersions]") + 1, table)
+    (tmp_path / "campaign.toml").write_text("\n".join(lines))
+    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
+    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    with pytest.raises(CampaignError, match=r"loads\.0 = .*: its table 'loads' is dispersed as a whole"):
+        study(tmp_path / "run", {"loads.0": 3.0})
 
 
 def test_invalid_value_of_a_variant_is_rejected(run: Path) -> None:
