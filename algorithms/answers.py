@@ -39,21 +39,36 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     covariance = check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
     if covariance is not None:
         check_covariance("covariance_m2_s2", covariance)
-    span, answer_span = None, answer.span_s
-    if answer_span is not None:
-        is_pair = isinstance(answer_span, tuple) and len(answer_span) == 2
-        if not is_pair or not all(isinstance(tag, float | int) for tag in answer_span):
-            raise bad_answer(f"span_s is {answer_span!r}; allowed: a tuple of two time tags, or None")
-        span = (float(answer_span[0]), float(answer_span[1]))
-        if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
-            raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
-        if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
-            allowed = f"within the images' time tags, {tags_s[0]} to {tags_s[-1]} s"
-            raise bad_answer(f"span_s is {span}; allowed: {allowed}")
-    elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
+    span = None if answer.span_s is None else _check_span(answer.span_s, tags_s)
+    if span is None and tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise bad_answer("one image has no last interval; allowed: a velocity with a span_s, or a failure outcome")
     attitude_error = check_numbers("attitude_error_rad", answer.attitude_error_rad, (3,))
     return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, (), attitude_error)
+
+
+def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """Validate an estimate; a missing time span becomes the last image interval.
+
+    Raises the same error as `check_velocity`.
+    """
+    estimate = check_velocity(answer, tags_s)
+    if estimate.span_s is not None or len(tags_s) < 2:
+        return estimate
+    return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
+
+
+def _check_span(answer_span: Any, tags_s: Sequence[float] | None) -> tuple[float, float]:
+    """Validate an averaging interval; it must lie within the images' time tags, if these are known."""
+    is_pair = isinstance(answer_span, tuple) and len(answer_span) == 2
+    if not is_pair or not all(isinstance(tag, float | int) for tag in answer_span):
+        raise bad_answer(f"span_s is {answer_span!r}; allowed: a tuple of two time tags, or None")
+    span = (float(answer_span[0]), float(answer_span[1]))
+    if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
+        raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
+    if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
+        allowed = f"within the images' time tags, {tags_s[0]} to {tags_s[-1]} s"
+        raise bad_answer(f"span_s is {span}; allowed: {allowed}")
+    return span
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:
@@ -71,10 +86,13 @@ def check_update(answer: Any) -> interface.TargetUpdate:
     """Validate a `TargetUpdate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
     check_type("the answer", answer, interface.TargetUpdate)
     check_type("state", answer.state, interface.TrackingState)
+    losses = answer.losses
+    if not isinstance(losses, tuple | list) or not all(isinstance(loss, interface.TargetLoss) for loss in losses):
+        raise bad_answer(f"losses is {losses!r}; allowed: a tuple of members of TargetLoss")
     position = check_numbers("position_rover", answer.position_rover, (3,))
     if answer.state is interface.TrackingState.NORMAL and position is None:
         raise bad_answer("state is NORMAL, but position_rover is None")
-    return interface.TargetUpdate(answer.state, answer.losses, position, answer.details)
+    return interface.TargetUpdate(answer.state, tuple(losses), position, answer.details)
 
 
 def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
@@ -89,14 +107,22 @@ def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
             raise bad_answer(f"{name}_rad is {angle!r}; allowed: {low:g} to {high:g}")
     for name, camera in (("left", mast.left), ("right", mast.right)):
         box = getattr(answer, name)
-        if not isinstance(box, interface.PixelBox):
-            raise bad_answer(f"{name} is a {_type_name(box)}; allowed: a PixelBox")
-        for corner, extent, frame_extent in zip(box.corner, box.size, camera.size, strict=True):
-            are_integers = all(isinstance(n, int | np.integer) for n in (corner, extent))
-            if not are_integers or corner < 0 or extent < 1 or corner + extent > frame_extent:
-                allowed = f"whole pixels inside the frame of {camera.size} pixels"
-                raise bad_answer(f"{name} has corner {box.corner} and size {box.size}; allowed: {allowed}")
+        check_type(name, box, interface.PixelBox)
+        if not _is_inside(box, camera.size):
+            allowed = f"whole pixels inside the frame of {camera.size} pixels"
+            raise bad_answer(f"{name} has corner {box.corner} and size {box.size}; allowed: {allowed}")
     return interface.MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
+
+
+def _is_inside(box: interface.PixelBox, frame_size: tuple[int, int]) -> bool:
+    """Whether a region consists of whole pixels of a frame of this size (columns, rows)."""
+    for pair in (box.corner, box.size):
+        if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
+            return False
+        if not all(isinstance(number, int | np.integer) for number in pair):
+            return False
+    axes = zip(box.corner, box.size, frame_size, strict=True)
+    return all(corner >= 0 and 1 <= extent <= frame_extent - corner for corner, extent, frame_extent in axes)
 
 
 def check_covariance(name: str, covariance: Float64[np.ndarray, "n n"]) -> None:
@@ -131,14 +157,3 @@ def check_type(name: str, value: Any, kind: type) -> None:
 
 def _type_name(value: object) -> str:
     return type(value).__name__
-
-
-def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate an estimate; a missing time span becomes the last image interval.
-
-    Raises the same error as `check_velocity`.
-    """
-    estimate = check_velocity(answer, tags_s)
-    if estimate.span_s is not None or len(tags_s) < 2:
-        return estimate
-    return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))

@@ -1,4 +1,4 @@
-"""Negative controls: algorithms for all four systems that cannot meet the requirements of a meaningful campaign.
+"""Negative controls: algorithms for all four tasks that cannot meet the requirements of a meaningful campaign.
 
 A requirement that a control meets does not depend on the images, or does not require an answer. Each class implements
 the protocols `VelocityEstimator`, `SiteEstimator`, `TargetTracker` and `PositionEstimator`. Images are not used, except

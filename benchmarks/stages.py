@@ -25,7 +25,7 @@ DESCENT_STAGES: Stages = {
     ),
     "instruments": (("descent/measurements.py", "draw"), ("descent/measurements.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
-    "feasible overlap": (("descent/conditions.py", "overlap_row"),),
+    "feasible overlap": (("descent/overlap.py", "overlap_row"),),
 }
 
 #: Name of the time outside all stages.

@@ -22,6 +22,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from marsyard.campaigns.definition import loading
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.campaigns.errors import CampaignError
@@ -125,6 +127,7 @@ def run(
             raise CampaignError("cases, seed and changes are for a campaign that is given by its name or file")
         name = campaign.definition.name
     else:
+        # without changes and algorithms: algorithms given as objects are stored in the folder with this name first
         name = loading.load_campaign(str(campaign)).definition.name
     folder = default_directory(name) if directory is None else Path(directory)
     specs = _name_algorithms([*([] if algorithm is None else [algorithm]), *compare], folder / "algorithms")
@@ -239,6 +242,8 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 def _format_toml(value: Any) -> str:
     """Format a value in TOML syntax."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_format_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):

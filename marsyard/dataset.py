@@ -76,6 +76,8 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             previous = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(previous, dict):
+                raise ValueError("it is not the manifest of a data set")
             for key in ("definition_sha256", "cases_per_shard"):
                 if previous.get(key) != manifest.get(key):
                     raise StoreError(f"{folder} contains another data set ({key} differs); choose another folder")

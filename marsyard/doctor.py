@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from ctypes.util import find_library
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -43,6 +44,8 @@ IMPORT_NAMES = {
 CONFLICTS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
 #: Debian packages of each GL backend; the preferred backend is first.
 BACKENDS = {"osmesa": "libosmesa6 libgl1 libxrender1", "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1"}
+#: The library that each backend loads, as in `marsyard.sim.render.backend`.
+LIBRARIES = {"osmesa": "OSMesa", "egl": "EGL"}
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
 BYTES_PER_MIB = 2**20
@@ -50,7 +53,19 @@ BYTES_PER_MIB = 2**20
 SUFFICIENT_DISK_MIB, MIN_DISK_MIB = 1024, 100
 #: Memory that one worker process needs, MiB.
 WORKER_MEMORY_MIB = 512
+#: Time limit of a separate process, seconds.
 PROBE_TIMEOUT_S = 30.0
+#: Program that imports the modules in its arguments; it prints name and error message of each module as JSON.
+_IMPORT_SCRIPT = """
+import importlib, json, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+        message = ""
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+    print(json.dumps([name, message]), flush=True)
+"""
 
 
 class CheckResult(Enum):
@@ -200,19 +215,6 @@ def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
     return failures
 
 
-#: Program that imports the modules in its arguments; it prints name and error message of each module as JSON.
-_IMPORT_SCRIPT = """
-import importlib, json, sys
-for name in sys.argv[1:]:
-    try:
-        importlib.import_module(name)
-        message = ""
-    except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-    print(json.dumps([name, message]), flush=True)
-"""
-
-
 def _list_requirements() -> list[Requirement]:
     """List the distributions that Marsyard requires on this platform, without extras."""
     requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
@@ -259,7 +261,7 @@ def check_rendering(probes: Mapping[str, Probe]) -> Iterator[DoctorCheck]:
     checks = {backend: _check_backend(backend, probe) for backend, probe in probes.items()}
     yield from checks.values()
     working = [backend for backend, check in checks.items() if check.verdict is OK]
-    selected_backend = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
+    selected_backend = _select_backend()
     if selected_backend not in BACKENDS:
         finding = f"MARSYARD_GL is '{selected_backend}'; allowed: {', '.join(BACKENDS)}"
         yield DoctorCheck("GL backend in use", finding, FAIL, "unset MARSYARD_GL")
@@ -272,6 +274,15 @@ def check_rendering(probes: Mapping[str, Probe]) -> Iterator[DoctorCheck]:
         yield DoctorCheck(
             "GL backend in use", "no backend works", FAIL, f"sudo apt-get install {BACKENDS[selected_backend]}"
         )
+
+
+def _select_backend() -> str:
+    """Return the backend of a campaign: that of MARSYARD_GL, otherwise the first one that is installed.
+
+    It is that of `marsyard.sim.render.backend.default_backend`; an invalid name is returned, too.
+    """
+    installed = (backend for backend in BACKENDS if find_library(LIBRARIES[backend]))
+    return os.environ.get("MARSYARD_GL", "").lower() or next(installed, next(iter(BACKENDS)))
 
 
 def _check_backend(backend: str, probe: Probe) -> DoctorCheck:

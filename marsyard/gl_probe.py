@@ -15,6 +15,8 @@ COLUMNS, ROWS, FOCAL_PX = 96, 64, 96.0
 NEAR_M, FAR_M = 40.0, 400.0
 #: Test planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` in front of a camera that looks along -z.
 DISTANCE_M, TILT = 100.0, 0.5
+#: Half of the planes' sides: they fill the image.
+HALF_SIDE_M = 400.0
 #: Tolerance of the depth, metres; a 24-bit depth buffer resolves 1e-5 m at the test planes.
 DEPTH_TOLERANCE_M = 2e-3
 #: Tolerance of the offset of the depth sample from the pixel's centre, pixels; larger offsets are reported.
@@ -34,8 +36,10 @@ def probe(backend: str) -> dict[str, Any]:
         # PyOpenGL detects a missing library only when it looks up one of its functions
         raise SystemExit(f"cannot load the OpenGL libraries ({error})") from None
 
-    # corners of the planes
-    x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
+    # corners of the planes, and the two triangles that they form
+    sides = [-HALF_SIDE_M, HALF_SIDE_M]
+    x, y = (axis.ravel() for axis in np.meshgrid(sides, sides))
+    triangles = [[0, 1, 3], [0, 3, 2]]
     # coordinates (right, down) of the pixel centres relative to the image centre, pixels
     # pyrender puts the centre of the first pixel at (0.5, 0.5); the y axis of the camera points up
     u, v = np.meshgrid(np.arange(COLUMNS) + 0.5 - COLUMNS / 2, np.arange(ROWS) + 0.5 - ROWS / 2)
@@ -45,7 +49,7 @@ def probe(backend: str) -> dict[str, Any]:
     try:
         for axis, pixels in ((x, u), (y, -v)):
             corners = np.column_stack([x, y, -DISTANCE_M + TILT * axis])
-            plane = trimesh.Trimesh(corners, [[0, 1, 3], [0, 3, 2]], process=False)
+            plane = trimesh.Trimesh(corners, triangles, process=False)
             scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0], bg_color=[0.0, 0.0, 0.0, 0.0])
             scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
             scene.add(camera, pose=np.eye(4))

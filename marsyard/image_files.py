@@ -24,17 +24,21 @@ SUFFIXES = (".png", ".npz", ".cahvor", ".json")
 
 
 def truth_layers(image: RenderedImage) -> dict[str, Any]:
-    """Compute the ground-truth layers, each with the rows and columns of the image, and the pose."""
+    """Compute the ground-truth layers, each with the rows and columns of the image, and the pose.
+
+    The shadow is found by rendering the image again, in direct sunlight only.
+    """
     frame, scene = image.frame, image.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
     is_ground = np.isfinite(frame.range_m)
-    # Render again without diffuse light: pixels with zero radiance are in shadow.
+    # without diffuse light, pixels with zero radiance are in shadow
     direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
     direct_frame = process_renderer(default_backend()).render(
         scene.with_photometry(direct_light).with_edge_rays(1), frame.rays, frame.world_from_body
     )
-    names = np.append(scene.objects.names, [-2, -1])  # body indices -2 (sky) and -1 (ground)
+    # the body indices -2 (sky) and -1 (ground) select the last two names
+    names = np.append(scene.objects.names, [-2, -1])
     return {
         "radiance_factor": frame.radiance,
         "range_m": frame.range_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -27,7 +28,7 @@ from marsyard.scenarios.timeline import Timeline
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Columns of the table of verdicts.
+#: Columns of the table of verdicts: fields of `Verdict`.
 _VERDICT_COLUMNS = ("status", "n", "failures", "estimate", "lower", "upper", "probability", "confidence", "note")
 #: Figures of all errors, by name.
 FIGURES = {
@@ -176,7 +177,9 @@ class Result:
         column = primary_metric(frame, run.requirements) if metric is None else metric
         if column is None or column not in frame:
             raise CampaignError(f"{self.directory} has no column '{column}'")
-        bound = next((item.bound for item in self.evaluation.verdicts if item.metric == column), None)
+        bounds = (item.bound for item in self.evaluation.verdicts if item.metric == column)
+        # a requirement on a boolean column has no bound (NaN)
+        bound = next((bound for bound in bounds if math.isfinite(bound)), None)
         drawn = FIGURES[name](frame, column, bound)
         if drawn is None:
             raise CampaignError(f"{self.directory} has no values of {column} for the figure '{name}'")

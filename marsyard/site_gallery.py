@@ -27,8 +27,8 @@ PAGE_WIDTH_PX = 760
 PAGE_QUALITY, FULL_QUALITY = 82, 92
 #: Columns of the contact sheet, and width and height of its cells.
 COLUMNS, CELL_PX = 4, (240, 180)
-#: Gap between the cells of the contact sheet, and height of the label below each.
-GAP_PX, LABEL_PX = 8, 22
+#: Gap between the cells of the contact sheet; height of the label below each, with its font scale and baseline.
+GAP_PX, LABEL_PX, LABEL_SCALE, LABEL_BASELINE_PX = 8, 22, 0.42, 8
 #: Grey levels of background and labels of the contact sheet.
 SHEET_BACKGROUND, SHEET_TEXT = 24, 235
 #: Maximum file size of the contact sheet, and the numbers of grey levels to try for it.
@@ -86,7 +86,8 @@ class GalleryImage:
 def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path]) -> Path:
     """Render all `VIEWS` and DTM files; write the gallery and return the path of the page.
 
-    Raises ValueError if a file is no DTM file, or if the gallery cannot be written or already exists.
+    The name of each image is printed to standard error before it is rendered. Raises ValueError if a file is no DTM
+    file, or if the gallery cannot be written or already exists.
     """
     requests = [ImageRequest.from_defaults(site, camera, **values) for site, camera, values in VIEWS]
     for file in terrain_files:
@@ -176,8 +177,8 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         cell = cv2.resize(crop, CELL_PX, interpolation=cv2.INTER_AREA)
         sheet[top : top + cell_height, left : left + cell_width] = cell
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
-        position = (left + 1, top + cell_height + LABEL_PX - 8)
-        cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, SHEET_TEXT, 1, cv2.LINE_AA)
+        position = (left + 1, top + cell_height + LABEL_PX - LABEL_BASELINE_PX)
+        cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, LABEL_SCALE, SHEET_TEXT, 1, cv2.LINE_AA)
     return compress_sheet(sheet)
 
 

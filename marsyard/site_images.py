@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, UInt16
 
 from marsyard.scenarios import views
-from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.radiance import add_haze
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
+from marsyard.scenarios.visible_rocks import add_unresolved_rocks, smallest_rock_rad
 from marsyard.sim import sensor
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
@@ -85,9 +85,10 @@ class ImageRequest:
             "sun-elevation": (self.sun_elevation_deg, 0.0, 90.0),
         }
         for name, (value, low, high) in ranges.items():
-            is_above_minimum = value >= low if name == "elevation" else value > low
-            if not (is_above_minimum and value <= high):
-                allowed = f"{low:g}" if name == "elevation" else f"more than {low:g}"
+            # a camera may look straight down, but is above the ground, and the sun above the horizon
+            includes_low = name == "elevation"
+            if not (low <= value <= high) or (value == low and not includes_low):
+                allowed = f"{low:g}" if includes_low else f"more than {low:g}"
                 raise ValueError(f"--{name} {value:g} is out of range; allowed: {allowed} to {high:g}")
         for name in ("east_m", "north_m", "azimuth_deg", "sun_azimuth_deg"):
             if not math.isfinite(value := getattr(self, name)):
@@ -158,7 +159,7 @@ def render_images(
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
     viewpoint = views.Viewpoint.from_pose(rays[0], pose, ground.surface)
     scene = _add_rover(views.site_scene(ground, viewpoint, sun), request, ground)
-    smallest_rad = views.smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
+    smallest_rad = smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(rendered_cameras):
@@ -180,7 +181,9 @@ def _add_rover(scene: Scene, request: ImageRequest, ground: views.SiteGround) ->
     camera = views.mast_pose(
         ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0
     )
-    stance = Stance(rigid(camera.rotation, camera.apply(-np.array(position_on_rover))), 0.0, (0.0, 0.0), np.zeros(6))
+    world_from_rover = rigid(camera.rotation, camera.apply(-np.array(position_on_rover)))
+    stance = Stance(world_from_rover, differential_rad=0.0, bogies_rad=(0.0, 0.0), gaps_m=np.zeros(6))
+    # the mast points straight ahead
     rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 
@@ -200,7 +203,10 @@ def _mark_filled(ground: views.SiteGround, frame: Frame) -> Bool[np.ndarray, "ro
 def _expose(
     request: ImageRequest, ground: views.SiteGround, camera: CameraModel, number: int, frame: Frame, sun: Sun
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
-    """Simulate the detector with automatic exposure time and without summed rows; return the detector and counts."""
+    """Simulate the detector with automatic exposure time and without summed rows; return the detector and counts.
+
+    `number` of the camera, 1 for the right one of a pair, selects its random streams.
+    """
     streams = Streams(request.seed, "render", number)
     preset, environment = sensor.preset(request.camera), ground.site.environment
     # the preset may be defined for the sun distance of another planet

@@ -23,7 +23,8 @@ class AlgorithmRun(Generic[Answer]):
 
     - answer: valid answer; None for a failure
     - failure: None for an answer
-    - row: columns: computation time (processor time; wall-clock time of an external program), and standard error
+    - row: columns: computation time (processor time; wall-clock time of an external program), with construction and
+      copying of the measurements; standard error
     """
 
     answer: Answer | None

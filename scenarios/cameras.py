@@ -54,8 +54,9 @@ def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.rando
     if isinstance(recentred, Cahv):
         recentred = Cahvor.from_cahv(recentred, r=np.zeros(3))
     # R1 displaces a point outwards by R1 chi^3; chi is the radial coordinate of its ray (`marsyard.sim.camera.models`)
-    corner = float(np.hypot(0.5 * (recentred.size[0] - 1), 0.5 * (recentred.size[1] - 1)))
+    corner_px = 0.5 * float(np.hypot(recentred.size[0] - 1, recentred.size[1] - 1))
     radial = cast(Cahvor | Cahvore, recentred)
-    chi = corner / (recentred.focal_lengths[0] * (1.0 + float(radial.r[0])))
-    displacement = p.distortion_error_px * distortion / recentred.focal_lengths[0]
+    focal_px = recentred.focal_lengths[0]
+    chi = corner_px / (focal_px * (1.0 + float(radial.r[0])))
+    displacement = p.distortion_error_px * distortion / focal_px
     return replace(radial, r=radial.r + np.array([0.0, displacement / chi**3, 0.0]))

@@ -64,12 +64,12 @@ def add_detector_faults(faults: SizedFaults, detector: DetectorParameters) -> De
 def corrupt_images(images: Images, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
     """Return images with transmission faults.
 
-    - repeated: number, from 1, of the image that is replaced by the previous image; 0: none
+    - repeated: number, from 2, of the image that is replaced by the previous image; 0: none
     - black: number, from 1, of the image that is replaced by a black image; 0: none
-    - lost_rows: fraction of the second image's rows that is lost, counted from the bottom
+    - lost_rows: fraction of the rows of image 2 that is lost, from the bottom
     """
     copies = [image.copy() for image in images]
-    if repeated > 1:
+    if repeated:
         copies[repeated - 1] = copies[repeated - 2].copy()
     if black:
         copies[black - 1][:] = 0

@@ -13,7 +13,7 @@ from enum import StrEnum
 from fnmatch import fnmatchcase
 from functools import cached_property
 
-#: Units by the ends of column names.
+#: Units by the ends of column names; an ending precedes all others that are its own end (`_deg_s` precedes `_s`).
 _UNITS = {
     "_deg_h_k": "deg/h/K", "_deg_h": "deg/h", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s",
     "_m2": "m²", "_mrad": "mrad", "_ppm": "ppm",
@@ -65,7 +65,8 @@ class Column:
     """A column, or several columns with a common pattern.
 
     - name: name; a star matches any text, such as the number of an image
-    - kind, type: what it describes; float for numbers, bool for flags, str for texts
+    - kind: what it describes
+    - type: type of its values: float for numbers, bool for flags, str for texts
     - meaning: noun phrase; for a flag, a clause
     - label: the quantity in words, for axes and tables, with the stars of the name; by default the words of the name
     - population: phrase after "cases" for the cases with a true flag; by default the clause
@@ -173,13 +174,13 @@ class Columns:
         matching = (item for item in self.columns if item.matches(name))
         return self._by_name.get(name) or max(matching, key=lambda item: len(item.name), default=None)
 
-    def names(self, kind: type[float | bool | str]) -> tuple[str, ...]:
-        """Return the names and patterns of a type."""
-        return tuple(item.name for item in self.columns if item.type is kind)
+    def names(self, value_type: type[float | bool | str]) -> tuple[str, ...]:
+        """Return the names and patterns of the columns with values of a type."""
+        return tuple(item.name for item in self.columns if item.type is value_type)
 
-    def has(self, name: str, kind: type[float | bool | str]) -> bool:
-        """Return whether a column of a type may have this name."""
-        return any(item.type is kind and item.matches(name) for item in self.columns)
+    def has(self, name: str, value_type: type[float | bool | str]) -> bool:
+        """Return whether a column with values of a type may have this name."""
+        return any(item.type is value_type and item.matches(name) for item in self.columns)
 
     @property
     def from_truth(self) -> dict[str, str]:

@@ -52,7 +52,7 @@ def import_algorithm(path: str) -> Any:
     """Import a custom algorithm in this process. Raises ValueError with the reason."""
     try:
         return import_object(path)
-    except (ImportError, AttributeError) as error:
+    except ImportError as error:
         raise ValueError(f"cannot import algorithm '{path}': {error}") from error
 
 

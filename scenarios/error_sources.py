@@ -49,6 +49,7 @@ def _find(tree: Any, path: str) -> Iterator[Any]:
 
 
 def _exact_value(path: str, value: Any, factor: float) -> Any:
+    """Return the value without its error, see `ScenarioSource.exact_values`; `path` is used in the message."""
     if isinstance(value, bool):
         return False
     if isinstance(value, int | float):

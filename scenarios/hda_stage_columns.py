@@ -12,12 +12,11 @@ DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.
 
 def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
     """Compute the errors of an estimated motion from the first to the second camera's frame."""
-    (translation, length), (true_translation, true_length) = (
-        (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (estimated, true)
-    )
-    has_directions = length and true_length
-    # chord between the unit vectors of both directions
-    chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if has_directions else np.nan
+    translation, true_translation = np.array(estimated.translation), np.array(true.translation)
+    length, true_length = float(np.linalg.norm(translation)), float(np.linalg.norm(true_translation))
+    chord = np.nan  # between the unit vectors of both directions, which a motion without translation lacks
+    if length > 0.0 and true_length > 0.0:
+        chord = float(np.linalg.norm(translation / length - true_translation / true_length))
     error = float(np.linalg.norm(translation - true_translation))
     return {
         "rotation_error_deg": float(np.degrees((estimated.rotation * true.rotation.inv()).magnitude())),

@@ -19,6 +19,8 @@ SHIELD_DIAMETER_M = 2.65
 SHIELD_DRIFT_M_S, SHIELD_TUMBLE_RAD_S = 2.0, 1.0
 #: Largest angle of the heat shield from nadir in the first image, radians (assumed).
 SHIELD_MAX_OFF_NADIR_RAD = 0.2
+#: Smallest cosine between a ray and the shield's normal, which keeps the distance of the intersection finite.
+_MIN_COSINE = 1e-9
 #: Assumed albedos of the shield: charred outside, insulated inside.
 SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO = 0.1, 0.5
 
@@ -63,7 +65,7 @@ class HeatShield:
         origin = frame.world_from_body.apply(frame.rays.centre)
         directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
         cosines = directions @ normal
-        distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > 1e-9, cosines, 1e-9)
+        distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > _MIN_COSINE, cosines, _MIN_COSINE)
         centre_distance = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
         is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M)
         # the camera sees the outside if the normal points towards it, otherwise the inside

@@ -1,28 +1,25 @@
-"""Relief on the horizon, and occlusion of the ground at grazing view by rocks below the rendering resolution."""
+"""Relief on the horizon of a terrain: hills of its site, and swells of the plain."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.random import Generator
 
-from marsyard.sim.render import Frame, Scene
-from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.skyline import Relief
-from marsyard.sim.terrain import RockField, Surface
+from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.sites import Hill
 
-#: Steps of azimuth around the horizon, and RMS irregularity of a hill's outline relative to its height (assumed).
-_AZIMUTHS, _IRREGULARITY = 8192, 0.25
+#: Steps of azimuth around the horizon.
+_AZIMUTHS = 8192
+#: RMS irregularity of a hill's outline relative to its height, and Hurst exponent of all outlines (assumed).
+_IRREGULARITY, _HURST = 0.25, 1.3
 #: Swells of the plain: RMS height and distance, metres, and size, radians (assumed).
 _SWELL_M, _SWELL_DISTANCE_M, _SWELL_RAD = 4.0, 3000.0, 0.3
 #: Albedo of hills relative to the plain's; assumed.
 _HILL_ALBEDO = 0.85
 _MARS_RADIUS_M = 3.39e6
-#: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
-_SILHOUETTE_FRACTION = 0.85
 
 
 def horizon_relief(hills: Sequence[Hill], surface: Surface, extinction_m: float, albedo: float) -> Relief:
@@ -57,40 +54,9 @@ def _draw_outline(
 
 
 def _draw_irregularity(largest_rad: float, rng: Generator) -> Float64[np.ndarray, "azimuths"]:
-    """Draw a fractal line around the horizon with the RMS 1 and a Hurst exponent of 1.3, white above `largest_rad`."""
+    """Draw a fractal line around the horizon with the RMS 1 and the exponent `_HURST`, white above `largest_rad`."""
     waves = np.arange(_AZIMUTHS // 2 + 1)
-    amplitude = (waves**2 + (2.0 * np.pi / largest_rad) ** 2) ** (-0.5 * (1.3 + 0.5))
+    amplitude = (waves**2 + (2.0 * np.pi / largest_rad) ** 2) ** (-0.5 * (_HURST + 0.5))
     amplitude[0] = 0.0
     line = np.fft.irfft(amplitude * (rng.standard_normal((len(waves), 2)) @ (1.0, 1.0j)))
     return np.asarray(line / line.std())
-
-
-def add_unresolved_rocks(
-    frame: Frame, scene: Scene, rocks: RockField | None, smallest_rad: float, rms_slope: float
-) -> Frame:
-    """Blend the mean radiance of the rendered rocks into ground pixels that rocks below the resolution occlude.
-
-    Rocks with diameters below ``smallest_rad x range`` are not rendered. At grazing view they hide the ground. The
-    visible fraction of the ground is ``exp(-A / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``. Here A is the frontal
-    area of these rocks per square metre, and e is the angle between the line of sight and level ground. Range and
-    normals are not changed.
-    """
-    # bodies -1 (ground) and -2 (sky) select the two appended numbers, which are negative, as no rock's number is
-    numbers = np.append(scene.objects.names, [-2, -1])[frame.body]
-    is_rock = (numbers >= 0) & (numbers < FIRST_MESH_NUMBER)
-    if rocks is None or len(rocks) == 0 or not np.any(is_rock):
-        return frame
-    order = np.argsort(rocks.diameter_m)
-    areas = _SILHOUETTE_FRACTION * (rocks.diameter_m * rocks.height_m)[order] / rocks.period_m**2
-    area_below = np.concatenate([[0.0], np.cumsum(areas)])
-    unresolved_counts = np.searchsorted(
-        rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0)
-    )
-    up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]
-    tan_elevation = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
-    occluded_fraction = -np.expm1(-area_below[unresolved_counts] / np.hypot(tan_elevation, rms_slope)).astype(
-        np.float32
-    )
-    rock_radiance = frame.radiance[is_rock].mean()
-    blended = frame.radiance + occluded_fraction * (rock_radiance - frame.radiance)
-    return replace(frame, radiance=np.where(frame.body == -1, blended, frame.radiance))

@@ -54,7 +54,10 @@ def source_files(path: str) -> Iterator[tuple[str, Path]]:
 
 
 def source_root(path: str) -> tuple[Path, ...]:
-    """Return the folder of the package, or the file, that contains ``module:name``; empty if it is not found."""
+    """Return the folders of the package, or the file, that contains ``module:name``; empty if it is not found.
+
+    A namespace package has several folders.
+    """
     module = path.rpartition(":")[0]
     if module.endswith(SUFFIX):
         return (Path(module),)
@@ -65,8 +68,9 @@ def source_root(path: str) -> tuple[Path, ...]:
         return ()
     if spec is None:
         return ()
-    folders = spec.submodule_search_locations
-    return tuple(map(Path, folders)) if folders else (Path(spec.origin),) if spec.origin else ()
+    if spec.submodule_search_locations:
+        return tuple(map(Path, spec.submodule_search_locations))
+    return (Path(spec.origin),) if spec.origin else ()
 
 
 def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -61,16 +62,21 @@ class MeshParameters(UserFile):
         period = surface.levels[0].shape[0] * surface.spacing_m
         position = np.array([self.east_m, self.north_m])
         position = position + period * np.round((np.array(point) - position) / period)
-        ground = float(surface.height(position[0], position[1]))
-        corners = corners + np.array([*position, ground - self.sink_m - float(corners[:, 2].min())])
-        if self.kind != "rock":  # normals of the faces
-            first, second, third = np.moveaxis(corners.reshape(-1, 3, 3), 1, 0)
-            normals = np.cross(second - first, third - first)
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0).repeat(3, axis=0)
+        ground_m = float(surface.height(*position))
+        corners = corners + np.array([*position, ground_m - self.sink_m - float(corners[:, 2].min())])
+        if self.kind != "rock":
+            normals = _face_normals(corners.reshape(-1, 3, 3)).repeat(3, axis=0)
         faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
         body_numbers = np.full(len(faces), FIRST_MESH_NUMBER, dtype=np.int32)
         return Objects.of_mesh(corners, normals, faces, body_numbers, self.albedo or _ALBEDO[self.kind])
+
+
+def _face_normals(triangles: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.ndarray, "faces 3"]:
+    """Return the unit normals of triangles; zero for a triangle without area."""
+    first, second, third = np.moveaxis(triangles, 1, 0)
+    normals = np.cross(second - first, third - first)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0))
 
 
 def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], point: tuple[float, float]) -> Scene:

@@ -20,11 +20,13 @@ CONVENTIONAL = (0.0, -1.0, -999.0, 999.0, -9999.0, 9999.0, -10000.0, 10000.0)
 _MIN_CLIFF_M, _CLIFF_FACTOR = 100.0, 10.0
 #: Fraction of the steps at the border that must be cliffs: holes touch each other and noise.
 _CLIFF_FRACTION = 0.95
-#: Rules for low cliffs (`_has_low_cliffs`): number of posts, maximum fraction of equal neighbours in the other ground,
-#: minimum slope of the cliffs (rise over run) if all are on one side and if they are on both sides of the value, the
-#: minimum fraction of steps up and down, and the ratio of median steps.
+#: Low cliffs: minimum number of posts, and maximum fraction of equal neighbours in the other ground.
 _MIN_POSTS, _MAX_EQUAL_FRACTION = 10, 0.01
-_CLIFF_SLOPE, _TWO_SIDED_SLOPE, _MIN_SIDE_FRACTION, _MEDIAN_FACTOR = 2.0, 0.5, 0.1, 5.0
+#: Low cliffs on one side of the value: minimum slope (rise over run).
+_CLIFF_SLOPE = 2.0
+#: Low cliffs on both sides of the value: minimum slope of the median step, minimum fraction of steps up and of steps
+#: down, and minimum median step divided by that of the ground.
+_TWO_SIDED_SLOPE, _MIN_SIDE_FRACTION, _MEDIAN_FACTOR = 0.5, 0.1, 5.0
 #: Number of values on the border of the file that are examined, the most frequent: a collar fills much of it.
 _MAX_BORDER_VALUES = 3
 #: Maximum number of steps for the percentiles of the ground.
@@ -62,6 +64,7 @@ def find_missing_value(heights: Grid, posting_m: float) -> MissingValue | None:
         is_value = heights == height
         if np.count_nonzero(is_value) >= _MIN_POSTS and _has_low_cliffs(heights, is_value, posting_m):
             candidates.append(MissingValue(float(height), int(np.count_nonzero(is_value))))
+    # the rarest: level ground next to missing posts also has cliffs
     return min(candidates, key=lambda item: (item.height_m not in CONVENTIONAL, item.posts), default=None)
 
 

@@ -54,7 +54,12 @@ class AnswerFormat(Generic[Answer]):
     @property
     def columns(self) -> tuple[str, ...]:
         """All columns."""
-        return ("case", "outcome", *(name for group in self.numbers.values() for name in group))
+        return ("case", "outcome", *self.number_columns)
+
+    @property
+    def number_columns(self) -> tuple[str, ...]:
+        """Columns of the numbers of all keys."""
+        return tuple(name for group in self.numbers.values() for name in group)
 
     @property
     def required_columns(self) -> tuple[str, ...]:
@@ -123,8 +128,8 @@ def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) ->
     if not cells["case"].isdecimal():
         raise ValueError(f"case is '{cells['case']}'; allowed: a whole number from 0")
     numbers = {}
-    # the first two columns are `case` and `outcome`
-    for name, text in ((name, text) for name, text in cells.items() if name in answer_format.columns[2:] and text):
+    filled = {name: text for name, text in cells.items() if name in answer_format.number_columns and text}
+    for name, text in filled.items():
         numbers[name] = value = finite_number(name, text, ", or an empty cell if the outcome is a failure")
         limits = ((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))
         unit, limit = next(limits, ("", math.inf))
@@ -139,8 +144,8 @@ def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) ->
     return int(cells["case"]), answer_format.create_answer(outcomes[outcome or next(iter(outcomes))], numbers)
 
 
+#: Prefixes of the names of an export and of a table of answers.
 EXPORT, ANSWERS = "export:", "answers:"
-
 #: Folder of the cases in an export.
 CASES = "cases"
 

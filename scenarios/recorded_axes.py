@@ -16,6 +16,8 @@ from marsyard.sim.parameters import Parameters
 _ENU_FROM_AXES = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
 #: OpenCV's camera axes (x right, y down, z forward) in body axes: optical axis along -z, columns along x.
 _CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+#: Maximum deviation of the mounting quaternion's length from 1, large enough for three digits.
+_QUATERNION_TOLERANCE = 1e-3
 
 
 class RecordedAxes(Parameters):
@@ -36,7 +38,7 @@ class RecordedAxes(Parameters):
 
     @model_validator(mode="after")
     def _check_mounting(self) -> RecordedAxes:
-        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > _QUATERNION_TOLERANCE:
             raise ValueError(f"mounting {list(self.mounting)} is not a quaternion of length 1")
         return self
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from marsyard.sim.parameters import Parameters, bounded_field, merge_parameters
 from marsyard.sim.render.backend import Backend, default_backend
@@ -32,6 +32,18 @@ def complete_terrain(
 def preset_terrain(name: str, scale: str) -> TerrainParameters | None:
     """Return the terrain of a site at a scale (`descent`, `ground`); None if there is none."""
     return None if getattr(sites().get(name), scale, None) is None else site(name).terrain(scale)
+
+
+def site_validator(user: str, scale: str) -> AfterValidator:
+    """Return a validator of site names: presets with a terrain at the scale; `user` is a noun for messages."""
+
+    def check(name: str | None) -> str | None:
+        allowed = [item.name for item in sites().values() if getattr(item, scale) is not None]
+        if name is not None and name not in allowed:
+            raise ValueError(f"unknown site '{name}' for {user}; allowed: {', '.join(allowed)}")
+        return name
+
+    return AfterValidator(check)
 
 
 class Location(Parameters):

@@ -9,10 +9,10 @@ import dis
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any
 
 #: Ending of a stored object.
@@ -68,7 +68,8 @@ def store_object(value: Any, folder: Path) -> str:
     source = _read_source(value)
     try:
         contents = cloudpickle.dumps(stored)
-        state = cloudpickle.dumps(vars(value)) if not isinstance(value, type) and hasattr(value, "__dict__") else b""
+        # with `__slots__`, unlike `vars`
+        state = b"" if isinstance(value, type) else cloudpickle.dumps(value.__getstate__())
         captured = _captured_values(value)
         state += cloudpickle.dumps(captured) if captured else b""
     except Exception as error:  # objects of users may raise anything
@@ -106,20 +107,20 @@ def _read_source(value: Any) -> str:
 
 
 def _captured_values(value: Any, known: frozenset[int] = frozenset()) -> list[Any]:
-    """List the values that the code of an object takes from outside: defaults, closures and global variables.
+    """List the values that the code of an object takes from outside: bases, attributes, defaults, closures and globals.
 
-    The code is that of a function, or of the methods of a class or of the class of an object. Two functions or classes
-    with the same source are different algorithms if these values differ. A class or function among them is represented
-    by its name and source, and by its own captured values. Code that worker processes import is stored without values.
+    The code is that of a function, or of a class or of the class of an object. Two functions or classes with the same
+    source are different algorithms if these values differ. A class or function among them is represented by its name
+    and source, and by its own captured values. Code that worker processes import is stored without values.
     """
     code = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
     if id(code) in known or _is_importable(code):
         return []
-    functions = (
-        [code] if inspect.isfunction(code) else [item for item in vars(code).values() if inspect.isfunction(item)]
-    )
+    members = [code] if inspect.isfunction(code) else _class_members(code)
+    functions = [item for item in members if inspect.isfunction(item)]
     captured: list[Any] = []
-    for item in (item for function in functions for item in _outside_values(function)):
+    outside_values = [item for item in members if not inspect.isfunction(item)]
+    for item in (*outside_values, *(item for function in functions for item in _outside_values(function))):
         if isinstance(item, type) or inspect.isfunction(item):
             source = "" if _is_importable(item) else _read_source(item)
             captured += [(item.__module__, item.__qualname__, source), *_captured_values(item, known | {id(code)})]
@@ -128,14 +129,38 @@ def _captured_values(value: Any, known: frozenset[int] = frozenset()) -> list[An
     return captured
 
 
+def _class_members(owner: type) -> list[Any]:
+    """List the bases, the functions and the values of the attributes of a class, without those of its bases."""
+    members: list[Any] = [base for base in owner.__bases__ if base is not object]
+    for name, item in vars(owner).items():
+        accessors: list[Any] = [item.fget, item.fset, item.fdel] if isinstance(item, property) else [item]
+        # those of static and class methods, and below decorators
+        functions = [inspect.unwrap(getattr(accessor, "__func__", accessor)) for accessor in accessors]
+        if any(map(inspect.isfunction, functions)):
+            members += filter(inspect.isfunction, functions)
+        elif not name.startswith(("__", "_abc_")) and not hasattr(type(item), "__get__"):
+            members.append(item)
+    return members
+
+
 def _outside_values(function: FunctionType) -> list[Any]:
     """List the defaults, the closure and the global variables of a function; names that have no value are omitted."""
     values = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
     for cell in function.__closure__ or ():
         with suppress(ValueError):  # the variable has no value yet
             values.append(cell.cell_contents)
-    names = sorted({item.argval for item in dis.get_instructions(function) if item.opname == "LOAD_GLOBAL"})
+    names = sorted(set(_global_names(function.__code__)))
     return values + [function.__globals__[name] for name in names if name in function.__globals__]
+
+
+def _global_names(code: CodeType) -> Iterator[str]:
+    """Yield the names of global variables in a function's code, and in the functions and classes inside."""
+    for item in dis.get_instructions(code):
+        if item.opname in ("LOAD_GLOBAL", "LOAD_NAME"):  # the latter in the bodies of classes
+            yield item.argval
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _global_names(constant)
 
 
 def _has_required_parameters(function: Callable[..., Any]) -> bool:

@@ -38,15 +38,18 @@ def variants(
     - `name`-custom: with the improvements that the options select
     """
 
-    def create_published(options: Any) -> Any:
+    def check_improvements(options: Any) -> None:
         defaults = type(options)()
         for key in improvements:
             if getattr(options, key) != getattr(defaults, key):
                 raise ValueError(f"'{name}' and '{name}-plus' define the option {key}; '{name}-custom' accepts it")
+
+    def create_published(options: Any) -> Any:
+        check_improvements(options)
         return create(options)
 
     def create_improved(options: Any) -> Any:
-        create_published(options)
+        check_improvements(options)
         return create(replace(options, **improvements))
 
     return {name: create_published, f"{name}-plus": create_improved, f"{name}-custom": create}

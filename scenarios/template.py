@@ -73,6 +73,11 @@ class CampaignTemplate:
         return template.render(asdict(choices), bank=bank, **self.values(choices))
 
 
+def _format_toml(value: Any) -> str:
+    """Format a value as TOML, which has two differences from JSON: no surrogates in escapes, and no raw U+007F."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def toml_environment(*folders: Path) -> Environment:
     """Return the environment of TOML templates in folders; the filter ``toml`` formats a value as TOML."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -85,5 +90,5 @@ def toml_environment(*folders: Path) -> Environment:
         keep_trailing_newline=True,
         autoescape=False,  # noqa: S701  (TOML, whose strings the filter quotes)
     )
-    environment.filters["toml"] = json.dumps
+    environment.filters["toml"] = _format_toml
     return environment

@@ -8,7 +8,6 @@ must have heights and cell sizes in metres.
 import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator
 
+from marsyard.scenarios.map_scale import NoInverseError, map_scale
 from marsyard.scenarios.missing_heights import find_missing_value
 from marsyard.sim.files import check_regular, read_npz_headers, report_damage
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
@@ -31,8 +31,12 @@ from marsyard.sim.terrain.rasters import (
 
 #: Maximum number of DTM posts along a side (size of the largest terrain), and of orthoimage pixels (memory).
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
+#: Maximum relative difference of a cell's sides: rounding in files.
+_MAX_SIDE_DIFFERENCE = 1e-6
 #: Maximum relative distortion of lengths by the projection.
 _MAX_STRETCH = 0.02
+#: Minimum number of values along a side of a grid.
+_MIN_SIDE = 4
 #: Range of heights on Earth, Moon and Mars: Mariana Trench to Olympus Mons.
 HEIGHTS_M = (-11_500.0, 22_000.0)
 #: Names of the unit metre in a GeoTIFF; without a name, heights are assumed to be in metres.
@@ -40,8 +44,6 @@ _METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
 _NO_GEOTIFF = "is not a valid GeoTIFF"
 #: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
-#: Distance from a pole, in cells, below which the direction of true north is undefined.
-_POLE_CELLS = 2.0
 #: File suffixes of terrain models.
 SUFFIXES = (".npz", ".tif", ".tiff", ".img", ".cub")
 #: Preset that supplies light, air, scattering and fine texture for imported ground.
@@ -59,18 +61,6 @@ def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
 
 #: A terrain whose files are checked: raises TerrainFileError if they are invalid.
 CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
-
-
-def site_validator(user: str, scale: str) -> AfterValidator:
-    """Return a validator of site names: presets with a terrain at the scale; `user` is a noun for messages."""
-
-    def check(name: str | None) -> str | None:
-        allowed = [item.name for item in sites().values() if getattr(item, scale) is not None]
-        if name is not None and name not in allowed:
-            raise ValueError(f"unknown site '{name}' for {user}; allowed: {', '.join(allowed)}")
-        return name
-
-    return AfterValidator(check)
 
 
 def check_source(source: RealTerrain) -> None:
@@ -129,8 +119,8 @@ def _npz_problems(source: RealTerrain) -> Iterator[str]:
             yield f"{name} contains values of type {dtype}; allowed: real numbers"
         if _ARRAYS.get(name) == 0 and np.prod(shape, dtype=np.float64) != 1:
             yield f"{name} has the shape {shape}; allowed: one number"
-        if _ARRAYS.get(name) == 2 and (len(shape) != 2 or min(shape) < 4 or max(shape) > limit):
-            yield f"{name} has a grid of shape {shape}; allowed: two dimensions of 4 to {limit} values"
+        if _ARRAYS.get(name) == 2 and (len(shape) != 2 or min(shape) < _MIN_SIDE or max(shape) > limit):
+            yield f"{name} has a grid of shape {shape}; allowed: two dimensions of {_MIN_SIDE} to {limit} values"
     if "ortho_valid" in headers and headers["ortho_valid"][0] != headers.get("ortho", headers["ortho_valid"])[0]:
         yield "ortho_valid and ortho have different shapes"
     with np.load(source.dtm, allow_pickle=False) as file:
@@ -142,8 +132,8 @@ def _npz_problems(source: RealTerrain) -> Iterator[str]:
 
 def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
     """Yield problems of a GeoTIFF's size, cells and projection and, for heights, of their unit and type."""
-    if min(file.width, file.height) < 4:
-        yield f"has {file.width} x {file.height} values; allowed: at least 4 x 4"
+    if min(file.width, file.height) < _MIN_SIDE:
+        yield f"has {file.width} x {file.height} values; allowed: at least {_MIN_SIDE} x {_MIN_SIDE}"
     if max(file.width, file.height) > max_side:
         yield (
             f"has {file.width} x {file.height} values; allowed: at most {max_side} along a side: extract a part with "
@@ -152,7 +142,7 @@ def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
     cell, crs = file.transform, file.crs
     if not (np.isfinite(cell.a) and cell.a > 0.0):
         yield f"its cells are {cell.a:g} wide; allowed: north up and east right (rio warp)"
-    if cell.b or cell.d or abs(cell.a + cell.e) > 1e-6 * abs(cell.a):
+    if cell.b or cell.d or abs(cell.a + cell.e) > _MAX_SIDE_DIFFERENCE * abs(cell.a):
         yield "has rotated or oblong cells; allowed: square cells, north up (rio warp --res)"
     if crs is None:
         yield "has no projection; add it with rio edit-info --crs"
@@ -203,7 +193,8 @@ def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None 
             raise TerrainFileError(f"{path}: contains values of type {file.dtypes[0]}; allowed: heights in metres")
         nodata = "has no nodata value" if file.nodata is None else f"has the nodata value {file.nodata:g}"
         advice = f"it {nodata}; set the value for missing data with rio edit-info --nodata"
-        posting_m = float(file.transform.a) * float(file.crs.linear_units_factor[1])
+        _, unit_m = file.crs.linear_units_factor
+        posting_m = float(file.transform.a) * float(unit_m)
         _check_values(path, read_heights(file), posting_m, dtm_source, advice)
         return file.crs
 
@@ -250,68 +241,6 @@ def _check_values(path: Path, values: np.ndarray, posting_m: float, source: Real
             f"{path}: the height {missing.height_m:.10g} m at {missing.posts} of {values.size} posts is probably a "
             f"value for missing data: it is repeated exactly, with cliffs at its border; {advice}"
         )
-
-
-@dataclass(frozen=True)
-class MapScale:
-    """Scale of a map projection at a point.
-
-    - min_ratio, max_ratio: extreme ratios of map lengths to ground lengths over all directions: the singular
-      values of the projection's derivative (Snyder 1987, Map Projections: A Working Manual, section 4)
-    - grid_north_deg: grid convergence: azimuth of the columns' upward direction, clockwise from true north, -180 to
-      180; None at a pole
-    """
-
-    min_ratio: float
-    max_ratio: float
-    grid_north_deg: float | None
-
-
-class NoInverseError(Exception):
-    """PROJ cannot compute the ground position of a point of a map projection."""
-
-
-def map_scale(file: Any) -> MapScale | None:
-    """Compute the scale of a rasterio dataset's projection at its centre; None if its terms are unknown.
-
-    Raises NoInverseError for a projection without inverse.
-    """
-    from rasterio._err import CPLE_BaseError  # GDAL's errors, which are no RasterioError
-    from rasterio.crs import CRS
-    from rasterio.errors import RasterioError
-    from rasterio.warp import transform
-
-    cell = file.transform
-    x, y = cell.c + 0.5 * file.width * cell.a, cell.f + 0.5 * file.height * cell.e
-    # central differences of positions in body-fixed axes, which have no singularity at the poles; the step is large
-    # compared with rounding and small compared with the curvature of the projection
-    step = max(abs(cell.a), 1.0)
-    xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]
-    try:
-        terms, unit_m = file.crs.to_dict(), float(file.crs.linear_units_factor[1])
-        body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
-        body_fixed = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
-        positions = np.array(transform(file.crs, body_fixed, xs, ys, [0.0] * 4), dtype=np.float64).T
-    except (RasterioError, ValueError):
-        return None
-    except CPLE_BaseError as error:
-        raise NoInverseError(str(error)) from error
-    # derivatives of the ground position with respect to the map's x and y
-    length = 2.0 * step * unit_m
-    tangent_x, tangent_y = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
-    # the eigenvalues of the Gram matrix are the squared extreme ratios
-    gram = np.array([[tangent_x @ tangent_x, tangent_x @ tangent_y], [tangent_x @ tangent_y, tangent_y @ tangent_y]])
-    if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
-        return None
-    ground_ratios = np.sqrt(np.linalg.eigvalsh(gram))
-    azimuth_deg = None
-    if float(np.hypot(*positions.mean(axis=0)[:2])) >= _POLE_CELLS * abs(cell.a) * unit_m:
-        normal = np.cross(tangent_x, tangent_y)
-        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
-        true_east = np.cross([0.0, 0.0, 1.0], normal)
-        true_north = np.cross(normal, true_east)
-        azimuth_deg = float(np.degrees(np.arctan2(tangent_y @ true_east, tangent_y @ true_north)))
-    return MapScale(1.0 / float(ground_ratios[1]), 1.0 / float(ground_ratios[0]), azimuth_deg)
 
 
 def is_terrain_file(name: str) -> bool:

@@ -44,7 +44,7 @@ class TerrainScenario(TypedScenario[ParametersType]):
         return tuple(range(bank)) if bank <= self.max_stored_terrains else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the shared inputs of a case with these sampled parameters: the number of its terrain in the bank."""
+        """Return the number of the case's terrain in the bank; it is no shared input if the bank is large."""
         return (self.location(self.check_parameters(parameters)).terrain,)
 
     def input_terrain(self, p: Any, shared_input: int) -> tuple[TerrainBank, int]:

@@ -28,7 +28,8 @@ PRODUCT = "timeline"
 def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True) -> dict[str, Any]:
     """Return the timeline as a product; empty, without a call of `create`, unless timelines are recorded.
 
-    is_tested: whether the products are those of the algorithm under test; other products are not stored
+    - is_tested: whether the products are those of the algorithm under test; other products are not stored
+
     An exception of `create` does not affect the case: its text is stored instead of the timeline.
     """
     if not is_recording_timelines() or not is_tested:
@@ -96,6 +97,7 @@ class CameraPose:
         """Create the pose of a camera that is fixed to a body."""
         axes = np.column_stack([camera.right, camera.down, camera.a])
         rotation = world_from_body.rotation * Rotation.from_matrix(axes)
+        _, corner_directions = camera.corner_rays()
         distortion = np.empty(0)
         if isinstance(camera, Cahvor | Cahvore):
             distortion = np.concatenate([axes.T @ camera.o, camera.r])
@@ -107,7 +109,7 @@ class CameraPose:
             np.array(camera.focal_lengths, dtype=np.float64),
             np.array(camera.image_centre, dtype=np.float64),
             distortion,
-            camera.corner_rays()[1] @ axes,
+            corner_directions @ axes,
         )
 
 

@@ -16,8 +16,8 @@ from marsyard.sim.render.backend import Backend
 
 #: Side of the image of `surface_from_above`, pixels, and the height of its camera divided by the half width.
 _SIDE_PX, _HEIGHT_RATIO = 384, 6.0
-#: Quantiles of the brightness that become black and white.
-_DARK, _BRIGHT = 0.005, 0.995
+#: Quantiles of the brightness that become black and white, and minimum difference between both, for black images.
+_DARK, _BRIGHT, _MIN_CONTRAST = 0.005, 0.995, 1e-9
 
 
 def surface_from_above(
@@ -48,5 +48,5 @@ def surface_from_above(
 def grey_values(brightness: Float32[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
     """Scale brightness to 8 bits; the darkest and the brightest 0.5 % become black and white."""
     low, high = np.quantile(brightness, (_DARK, _BRIGHT))
-    scaled = (brightness - low) * (255.0 / max(float(high - low), 1e-9))
+    scaled = (brightness - low) * (255.0 / max(float(high - low), _MIN_CONTRAST))
     return np.asarray(np.clip(scaled, 0.0, 255.0), dtype=np.uint8)

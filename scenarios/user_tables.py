@@ -82,7 +82,7 @@ def _header_problems(
             yield f"the column '{name}' is missing"
     for name in dict.fromkeys(header):
         if name not in allowed:
-            matches = difflib.get_close_matches(name, allowed, n=1, cutoff=0.6)
+            matches = difflib.get_close_matches(name, allowed, n=1)
             suggestion = f" (did you mean '{matches[0]}'?)" if matches else ""
             yield f"unknown column '{name}'{suggestion}; {hint}"
         if header.count(name) > 1:

@@ -1,4 +1,4 @@
-"""Parts of the timelines that descents and the field test share: body, paths, images and velocities."""
+"""Timeline of a case of velocity estimation: paths, images with the tracks of DIMES, altitude, speed and attitude."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,11 +102,10 @@ class VelocityCase:
         self, details: DimesDetails, number: int, size: tuple[int, int]
     ) -> dict[str, Float64[np.ndarray, "_ 2"]]:
         """Return the pixels of templates and matches in an image; those of DIMES are in binned images."""
-        triple = self.triple or ()
+        triple = self.triple or ()  # without a triple, DIMES has no tracks
         marks: dict[str, list[Float64[np.ndarray, "2"]]] = {"templates": [], "matches": [], "rejected": []}
         for track in details.tracks:
-            size_px = np.array(details.pairs[track.pair].views[0].size)
-            scale = np.array(size) / size_px
+            scale = np.array(size) / np.array(details.pairs[track.pair].views[0].size)
             for image, pixel, name in (
                 (triple[track.pair], track.template_pixel, "templates"),
                 (triple[track.pair + 1], track.match_pixel, "matches"),
@@ -117,10 +116,9 @@ class VelocityCase:
 
     def _track_points(self, details: DimesDetails) -> dict[str, TimedPoints]:
         """Return the templates on the ground at the times of their images."""
-        names = {True: "valid templates", False: "rejected templates"}
         points = {}
-        for is_valid, name in names.items():
-            tracks = [track for track in details.tracks if track.valid is is_valid]
+        for is_valid, name in ((True, "valid templates"), (False, "rejected templates")):
+            tracks = [track for track in details.tracks if track.valid == is_valid]
             states = [self.states[(self.triple or ())[track.pair]] for track in tracks]
             horizontal = [state.position_m[:2] + track.ground_m for state, track in zip(states, tracks, strict=True)]
             positions = np.array([[*point, float(self.surface.height(*point))] for point in horizontal]).reshape(-1, 3)

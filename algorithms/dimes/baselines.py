@@ -95,7 +95,7 @@ def rectify_pair(first: BinnedView, second: BinnedView, options: CommonOptions) 
     for view in (first, second):
         visible &= ground_view.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
     # chessboard distance to the nearest invisible point, lattice steps; all closer points are visible
-    distances = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    distances = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(distances)), distances.shape)
     side = min(2 * (int(distances[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     if side < options.min_side_px:

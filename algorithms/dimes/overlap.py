@@ -20,6 +20,11 @@ from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 MIN_SIGNAL_FRACTION = 0.01
 #: Number of pixels along each side of an image's border that are projected for its outline.
 _BORDER_PIXELS = 8
+#: Points along a side of a square's outline: its corners and the middles of its sides, which distortion bends.
+OUTLINE_POINTS = 3
+#: Points along a side of the lattices over template and search window that must not lie in the zero-phase spot: their
+#: spacing is less than the radius of the spot.
+_TEMPLATE_POINTS, _WINDOW_POINTS = 4, 7
 
 
 @dataclass(frozen=True)
@@ -137,31 +142,39 @@ def template_candidates(
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = ground_view.ground_from_pixels(first, pixels, limit)
-    width_m = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options)
-    visible &= width_m >= geometry.max_displacement_m
-    pixels, ground = pixels[visible], ground[visible]
-
-    def fits(view: BinnedView, half_m: float) -> Flags:
-        outline = ground_view.square_outline(half_m, 3)
-        return np.asarray(
-            ground_view.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
-        )
-
+    is_wide = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options) >= geometry.max_displacement_m
+    feasible = visible & is_wide
+    pixels, ground = pixels[feasible], ground[feasible]
     feasible = ground_view.inside_frame(second, ground, 0.0, limit)
     pixels, ground = pixels[feasible], ground[feasible]
-    feasible = fits(first, geometry.template_half_m)
+    template_half_m, window_half_m = geometry.template_half_m, geometry.window_half_m
+    feasible = _lie_in_view(first, ground, template_half_m, options)
     pixels, ground = pixels[feasible], ground[feasible]
+    is_valid = np.ones(len(ground), dtype=bool)
+    for view in (first, second):
+        is_valid &= _are_outside_spot(view, ground, template_half_m, _TEMPLATE_POINTS, sun_direction, options)
+    is_inside = _lie_in_view(second, ground, template_half_m, options)
+    is_complete = _lie_in_view(second, ground, window_half_m, options)
+    is_outside = _are_outside_spot(second, ground, window_half_m, _WINDOW_POINTS, sun_direction, options)
+    preference = np.sum([is_inside, is_complete, is_complete & is_outside], axis=0)
+    return Candidates(pixels[is_valid], ground[is_valid], preference[is_valid])
 
-    def is_outside_spot(view: BinnedView, half_m: float, per_side: int) -> Flags:
-        points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
-        outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
-        return np.asarray(outside.all(axis=1))
 
-    valid = is_outside_spot(first, geometry.template_half_m, 4) & is_outside_spot(second, geometry.template_half_m, 4)
-    complete = fits(second, geometry.window_half_m)
-    outside = is_outside_spot(second, geometry.window_half_m, 7)
-    preference = np.sum([fits(second, geometry.template_half_m), complete, complete & outside], axis=0)
-    return Candidates(pixels[valid], ground[valid], preference[valid])
+def _lie_in_view(view: BinnedView, ground: Points2, half_m: float, options: DimesOptions) -> Flags:
+    """Whether squares of half side `half_m` around ground points lie in a view."""
+    outlines = ground[:, None] + ground_view.square_outline(half_m, OUTLINE_POINTS)
+    return np.asarray(
+        ground_view.inside_frame(view, outlines, options.border_px, options.max_off_nadir_rad).all(axis=1)
+    )
+
+
+def _are_outside_spot(
+    view: BinnedView, ground: Points2, half_m: float, per_side: int, sun_direction: Vector3, options: DimesOptions
+) -> Flags:
+    """Whether squares around ground points are outside of the zero-phase spot, by lattices of `per_side` points."""
+    points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
+    outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
+    return np.asarray(outside.all(axis=1))
 
 
 def searchable_positions(

@@ -30,8 +30,9 @@ from marsyard.algorithms.image.registration import WindowSpline, register_templa
 
 #: Distance of templates from the border of both images, pixels: range of the registration and support of its spline.
 MARGIN_PX = 4
-#: Unknowns of the fit; `Unknowns` names its parts.
+#: Unknowns of the fit, and numbers of unknowns in its parts, which `Unknowns` names.
 State = Float[np.ndarray, "18"]
+_PART_SIZES = (2, 4, 3, 9)
 #: Minimum number of tracks in each pair. With fewer tracks outliers cannot be recognised.
 MIN_TRACKS = 8
 #: Residuals of more than this number of standard deviations are outliers.
@@ -104,8 +105,8 @@ def track_grid(
 
 def _is_usable(view: BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions) -> Flags:
     """Whether templates around ground points lie in a view and outside of its zero-phase spot."""
-    outline = ground_view.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)
-    squares = ground[:, None] + outline
+    half_m = (0.5 * options.grid_template_px + MARGIN_PX) * gsd_m
+    squares = ground[:, None] + ground_view.square_outline(half_m, overlap.OUTLINE_POINTS)
     inside = ground_view.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
     outside = ground_view.outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
     return np.asarray((inside & outside).all(axis=1))
@@ -148,7 +149,7 @@ class Unknowns(NamedTuple):
     @classmethod
     def unpack(cls, state: State) -> Unknowns:
         """Return views of the parts of a state."""
-        inclination, displacements, altitudes, attitudes = np.split(state, (2, 6, 9))
+        inclination, displacements, altitudes, attitudes = np.split(state, np.cumsum(_PART_SIZES[:-1]))
         return cls(inclination, displacements.reshape(2, 2), altitudes, attitudes.reshape(3, 3))
 
 
@@ -180,7 +181,7 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
     """
     inclination_sd = np.hypot(options.tilt_sd_rad, options.slope_sd_rad)
     # the displacements have no prior
-    scale = np.repeat([inclination_sd, 1.0, options.altitude_sd, options.attitude_sd_rad], [2, 4, 3, 9])
+    scale = np.repeat([inclination_sd, 1.0, options.altitude_sd, options.attitude_sd_rad], _PART_SIZES)
 
     def track_residuals(state: State) -> list[Float[np.ndarray, "_ 2"]]:
         return [(pair.second - predict_matches(state, k, pair)[0]) / pair.gsd_m for k, pair in enumerate(pairs)]
@@ -193,10 +194,11 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
 
         return np.asarray(optimize.least_squares(residuals, start, x_scale=scale, method="lm").x)
 
-    start = np.zeros(18)
-    for part, velocity, pair in zip(Unknowns.unpack(start).displacements_m, velocities_m_s, pairs, strict=True):
-        part[:] = velocity * pair.interval_s
-    state, inliers, sd_px = start, [np.ones(len(pair.first), dtype=bool) for pair in pairs], options.track_sd_px
+    # start with level ground, the initial velocities, and no corrections
+    no_inclination, _, *no_corrections = (np.zeros(size) for size in _PART_SIZES)
+    displacements_m = [velocity * pair.interval_s for velocity, pair in zip(velocities_m_s, pairs, strict=True)]
+    state = np.concatenate([no_inclination, *displacements_m, *no_corrections])
+    inliers, sd_px = [np.ones(len(pair.first), dtype=bool) for pair in pairs], options.track_sd_px
     for _ in range(FITS):
         state = fit(state, inliers, sd_px)
         residuals = track_residuals(state)

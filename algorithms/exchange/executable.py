@@ -102,7 +102,7 @@ class ExecutableTargetTracker(ExecutableAlgorithm):
         """Send a request and store the state in its answer."""
         answer = super()._call(name, *arguments)
         if name != "aim":
-            self.state = getattr(answer, "state", answer)
+            self.state = answer.state if isinstance(answer, interface.TargetUpdate) else answer
         return answer
 
 

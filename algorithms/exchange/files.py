@@ -43,8 +43,12 @@ CASE_FILE, IMAGE_FILE = "case.json", "image.json"
 
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
-
-
+#: Key of the pose of a rover.
+_ROVER = "world_from_rover"
+#: JSON files of a mast and of a rover stop.
+MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+#: Fields of `MastGeometry`: offsets between its joints, m, and limits of its angles, rad.
+_OFFSET_KEYS, _LIMIT_KEYS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 #: Image file format.
 ImageFormat = Literal["pgm", "png"]
 
@@ -169,14 +173,6 @@ def read_counts(path: Path) -> UInt16[np.ndarray, "rows columns"]:
     if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
         raise ValueError(f"{path} is not a single-channel 16-bit image")
     return np.asarray(counts, dtype=np.uint16)
-
-
-#: Key of the pose of a rover.
-_ROVER = "world_from_rover"
-#: JSON files of a mast and of a rover stop.
-MAST_FILE, STOP_FILE = "mast.json", "stop.json"
-#: Fields of `MastGeometry`: offsets between its joints, m, and limits of its angles, rad.
-_OFFSET_KEYS, _LIMIT_KEYS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 
 
 def write_mast(folder: Path, mast: MastCalibration) -> None:

@@ -26,6 +26,18 @@ from marsyard.algorithms.worker_device import worker_device
 
 #: Maximum time between two readings of an `AwakeClock` that is counted, s.
 _MAX_STEP_S = 1.0
+#: Interval of the checks of time, memory and output, and of the files' size, seconds.
+_POLL_S, _FILES_POLL_S = 0.02, 0.5
+#: Number of characters stored from the end of standard error.
+MAX_STDERR_CHARACTERS = 4000
+#: Time for a persistent program to exit after its input is closed, seconds.
+_EXIT_GRACE_S = 0.5
+#: Maximum number of bytes in one read or write of a pipe.
+_CHUNK_BYTES = 1 << 16
+#: Unit of a file's `st_blocks`, bytes.
+_BLOCK_BYTES = 512
+#: Environment variable: device that a program may use.
+DEVICE_VARIABLE = "MARSYARD_DEVICE"
 
 
 class AwakeClock:
@@ -43,18 +55,6 @@ class AwakeClock:
         self._elapsed_s += min(now_s - self._last_s, _MAX_STEP_S)
         self._last_s = now_s
         return self._elapsed_s
-
-
-#: Interval of the checks of time, memory and output, and of the files' size, seconds.
-_POLL_S, _FILES_POLL_S = 0.02, 0.5
-#: Number of characters stored from the end of standard error.
-MAX_STDERR_CHARACTERS = 4000
-#: Time for a persistent program to exit after its input is closed, seconds.
-_EXIT_GRACE_S = 0.5
-#: Maximum number of bytes in one read or write of a pipe.
-_CHUNK_BYTES = 1 << 16
-#: Environment variable: device that a program may use.
-DEVICE_VARIABLE = "MARSYARD_DEVICE"
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class RunningProgram:
             raise AlgorithmError(Fault.CRASHED, message) from error
         #: time that is left for the answers to the present case, s
         self.left_s = limits.total_s
-        self._clock, self._time_s = AwakeClock(), limits.time_s
+        self._clock, self._time_s = AwakeClock(), min(limits.time_s, self.left_s)
         self._checked_s = self._files_checked_s = 0.0
 
     @property
@@ -265,10 +265,11 @@ class RunningProgram:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _collect_output(self, output: bytes, start_s: float) -> Output:
-        """Build the output, including pending data of standard error. Raises AlgorithmError for too large files."""
+        """Build the output, including pending data of standard error. Raises AlgorithmError if it exceeds a limit."""
         self._check_files()
         while pending := _read_pending(self._process.stderr):
             self._stderr.extend(pending)
+            self._check_limits()
         return Output(output, _decode_tail(self._stderr), time.perf_counter() - start_s)
 
 
@@ -278,12 +279,12 @@ def temporary_folder() -> Path:
 
 
 def _folder_bytes(folder: Path) -> int:
-    """Sum the sizes of all files in a folder; files that are removed meanwhile are not counted."""
+    """Sum the sizes of all files in a folder on the disk; files that are removed meanwhile are not counted."""
     total = 0
     for parent, _, names in os.walk(folder):
         for name in names:
             with suppress(OSError):
-                total += Path(parent, name).lstat().st_blocks * 512
+                total += Path(parent, name).lstat().st_blocks * _BLOCK_BYTES
     return total
 
 

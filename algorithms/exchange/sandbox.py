@@ -5,6 +5,7 @@ process, no network, no environment variables of the user, and no other files: n
 its seed, nor the cache of terrains.
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -43,7 +44,8 @@ def sandbox_words(
     - readable: further files and folders that it can read
     """
     program = shutil.which(words[0]) or words[0]
-    named = [path for path in map(Path, words[1:]) if path.exists()]
+    # `os.path.exists` is false for an empty word, and for words that are too long for a path
+    named = [Path(word) for word in words[1:] if os.path.exists(word)]  # noqa: PTH110
     options = ["--unshare-all", "--die-with-parent", "--cap-drop", "ALL", "--proc", "/proc", "--dev", "/dev"]
     options += ["--clearenv", "--setenv", "HOME", str(folder)]
     for name, value in environment.items():
@@ -52,7 +54,7 @@ def sandbox_words(
     options += ["--dir", str(working_folder)]
     visible: list[Path] = []
     for path in [*map(Path, _SYSTEM), *_python_folders(), Path(program), *named, *readable]:
-        if not any(path.absolute().is_relative_to(folder) for folder in visible):
+        if not any(path.absolute().is_relative_to(parent) for parent in visible):
             visible.append(path.absolute())
             options += ["--ro-bind-try", str(visible[-1]), str(visible[-1])]
     options += ["--bind", str(folder), str(folder), "--chdir", str(working_folder), "--"]

@@ -133,9 +133,13 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
 
     The caller must pass it to `release_server` afterwards.
     """
-    if command.persistent and (idle := _idle.pop((command, limits), None)) is not None and idle.child.is_running():
-        idle.child.left_s = limits.total_s
-        return idle
+    idle = _idle.pop((command, limits), None)
+    if idle is not None:
+        if idle.child.is_running():
+            idle.child.left_s = limits.total_s
+            return idle
+        # also removes its folder and its child processes
+        idle.child.stop()
     child = command.start(limits)
     output = child.read_line(time_s=child.max_greeting_s)
     try:
@@ -172,7 +176,7 @@ def end_idle_programs() -> None:
 class Session:
     """Connection of one algorithm to a program: one JSON line per request. The first request starts the program.
 
-    The session's `folder` is removed with the session.
+    The session's `folder` is removed with the session. After an AlgorithmError the session has ended.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -183,6 +187,7 @@ class Session:
         self._folder: Path | None = None
         self._kept: KeptFolder | None = None
         self._kept_path = Path()
+        self._has_ended = False
 
     @property
     def folder(self) -> Path:
@@ -203,8 +208,11 @@ class Session:
         """Send the request `action` with `values`; return the program's answer without its `id`, and its raw output.
 
         A value that is a function writes the files of a folder, which is removed after the answer. A value can also be
-        a `KeptFolder`. The request contains the paths of the folders.
+        a `KeptFolder`. The request contains the paths of the folders. Raises AlgorithmError if the program fails, and
+        for every later request.
         """
+        if self._has_ended:
+            raise AlgorithmError(Fault.CRASHED, "its process ended after an earlier fault")
         server = self._acquire()
         with tempfile.TemporaryDirectory(prefix=f"{action}-", dir=self.folder) as request_folder:
             request = {key: self._write(Path(request_folder, key), value) for key, value in values.items()}
@@ -212,6 +220,7 @@ class Session:
                 return server.send_request({"do": action, **request})
             except AlgorithmError:
                 # the program has ended: do not return it to the idle programs
+                self._has_ended = True
                 if self._release is not None:
                     self._release.detach()
                 raise

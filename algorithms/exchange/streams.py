@@ -58,7 +58,8 @@ class StreamForm(Generic[Answer]):
     def serve(self, stream: Any, requests: Iterable[str] | None = None, answers: TextIOBase | None = None) -> None:
         """Answer the requests on standard input with a Python stream, one line each, until the input ends.
 
-        The stream's own output goes to standard error. Its exceptions end the program.
+        `requests` and `answers` replace standard input and output. The stream's own output goes to standard error. Its
+        exceptions end the program.
         """
         output = sys.stdout if answers is None else answers
         print(json.dumps({"exchange": EXCHANGE_VERSION, "ready": True}), file=output, flush=True)
@@ -66,8 +67,8 @@ class StreamForm(Generic[Answer]):
             for line in sys.stdin if requests is None else requests:
                 request = json.loads(line)
                 answer = self.answer.encode(self._call(stream, request))
-                line = json.dumps({"exchange": EXCHANGE_VERSION, "id": request["id"], **answer})
-                print(line, file=output, flush=True)
+                answer_line = json.dumps({"exchange": EXCHANGE_VERSION, "id": request["id"], **answer})
+                print(answer_line, file=output, flush=True)
 
     def _call(self, stream: Any, request: Mapping[str, Any]) -> Answer | None:
         """Call the stream's method of a request, if it has it. Raises ValueError for an unknown request."""

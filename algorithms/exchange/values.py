@@ -61,10 +61,10 @@ def decode(kind: type[Item], content: Mapping[str, Any], **given: Any) -> Item:
     """
     values, types = dict(given), get_type_hints(kind)
     for name in (field.name for field in fields(kind) if field.name not in given):  # type: ignore[arg-type]
-        if name + _ROTATION in content:
-            is_pose = types[name] is RigidTransform
-            rotation = decode_pose(name, content) if is_pose else Rotation.from_quat(content[name + _ROTATION])
-            values[name] = rotation
+        if name + _ROTATION in content and types[name] is RigidTransform:
+            values[name] = decode_pose(name, content)
+        elif name + _ROTATION in content:
+            values[name] = Rotation.from_quat(content[name + _ROTATION])
         elif name in content:
             values[name] = _decode_value(types[name], content[name])
     return kind(**values)

@@ -28,6 +28,19 @@ CONFIDENCE = 0.9999
 #: Methods and inlier distances (pixels) of `cv2.findEssentialMat`; the best result is used. A planar scene has two
 #: solutions; each method sometimes returns the wrong solution, in which most tracks are behind a camera.
 ATTEMPTS = ((cv2.LMEDS, 1.0), (cv2.RANSAC, 0.1), (cv2.RANSAC, 0.3), (cv2.RANSAC, 1.0), (cv2.USAC_PROSAC, 0.1))
+#: Window side of the semi-global matching, pixels, and the penalties (P1, P2) of disparity steps recommended by OpenCV.
+BLOCK_PX = 5
+SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
+#: OpenCV requires the number of disparities to be a multiple of this.
+DISPARITY_STEP = 16
+#: OpenCV's unit of disparity, pixels.
+DISPARITY_UNIT = 1.0 / 16.0
+#: Largest cosine between the baseline and the mean optical axis for which images are rectified.
+MAX_BASELINE_COSINE = 0.8
+#: Largest side of a rectified image, in diagonals of the original images.
+MAX_SIDE_DIAGONALS = 2.0
+#: Quantile of the counts that becomes white in 8-bit images; few pixels are brighter.
+WHITE_QUANTILE = 0.995
 
 
 @final
@@ -68,19 +81,6 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
         return None
     motion = assess_motion(first, second, focal, second_from_first, depths, True, options)
     return motion.scale(scene.range_m / float(np.median(positive_depths)))
-
-
-#: Window side of the semi-global matching, pixels, and the penalties (P1, P2) of disparity steps recommended by OpenCV.
-BLOCK_PX = 5
-SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
-#: OpenCV requires the number of disparities to be a multiple of this.
-DISPARITY_STEP = 16
-#: OpenCV's unit of disparity, pixels.
-DISPARITY_UNIT = 1.0 / 16.0
-#: Largest cosine between the baseline and the mean optical axis for which images are rectified.
-MAX_BASELINE_COSINE = 0.8
-#: Largest side of a rectified image, in diagonals of the original images.
-MAX_SIDE_DIAGONALS = 2.0
 
 
 @final
@@ -128,7 +128,7 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
     rectified_from_first = Rotation.from_matrix(np.stack([baseline_axis, np.cross(axis, baseline_axis), axis]))
     focal = views[0].focal_px
     border_rays = [
-        rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(16))[1]))
+        rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(steps=16))[1]))
         for view, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
     ]
     rays = np.concatenate(border_rays)
@@ -146,7 +146,7 @@ def match_disparities(
 ) -> Float[np.ndarray, "rows columns"]:
     """Compute disparities (pixels) in the first rectified image by semi-global matching; NaN without a match."""
     first_from_rectified = rectification.rectified_from_first.inv()
-    full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
+    full_scale = max(float(np.quantile(views[0].counts, WHITE_QUANTILE)), 1.0)
     rotations = (first_from_rectified, second_from_first.rotation * first_from_rectified)
     rays = rectification.camera.rays(rectification.camera.pixel_grid())[1].reshape(-1, 3)
     images = []

@@ -8,6 +8,11 @@ from jaxtyping import Float, Num
 
 from marsyard.algorithms.arrays import Mask, Points2, Points3, Raster, Vector, Vector2
 
+#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
+MIN_WEIGHT = 0.1
+#: Minimum side of a cell, as a fraction of the points' extent: the points of smaller cells lie on a line.
+_MIN_CELL_FRACTION = 1e-6
+
 
 def grassfire(mask: Mask) -> Raster:
     """Grassfire transform (Blum 1973): distance of every cell to the nearest true cell of a mask, in cells.
@@ -23,10 +28,6 @@ def grassfire(mask: Mask) -> Raster:
 def dilate(mask: Mask, radius_cells: float) -> Mask:
     """Dilate a mask by a disc: a cell becomes true within `radius_cells` of a true cell."""
     return np.asarray(mask | (grassfire(mask) <= radius_cells))
-
-
-#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
-MIN_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     extent = high - low
     cell = float(np.sqrt(extent[0] * extent[1] / len(points)))
-    if not cell > 1e-6 * float(extent.max()):
+    if not cell > _MIN_CELL_FRACTION * float(extent.max()):
         return None
     columns, rows = (int(count) for count in np.ceil(extent / cell))
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
@@ -105,15 +106,13 @@ def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:
     padded = np.pad(holes, margin, constant_values=True)
     # morphological opening: the parts of holes that a disc of this diameter covers
     wide = dilate(grassfire(~padded) >= radius_cells, radius_cells - 0.5)[margin:-margin, margin:-margin]
+    along_rows = _interpolate_rows(ground.elevation_m)
+    along_columns = [array.T for array in _interpolate_rows(ground.elevation_m.T)]
     sums, weights = np.zeros(holes.shape), np.zeros(holes.shape)
-    for values, axis_sums, axis_weights in (
-        (ground.elevation_m, sums, weights),
-        (ground.elevation_m.T, sums.T, weights.T),
-    ):
-        value, gap = _interpolate_rows(values)
+    for value, gap in (along_rows, along_columns):
         is_known = np.isfinite(value)
-        axis_sums += np.where(is_known, value, 0.0) / gap
-        axis_weights += is_known / gap
+        sums += np.where(is_known, value, 0.0) / gap
+        weights += is_known / gap
     filled = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights > 0.0)
     return replace(ground, elevation_m=np.where(holes & ~wide, filled, ground.elevation_m))
 

@@ -140,7 +140,10 @@ def check_motion(motion: CameraMotion | None, options: HdaOptions) -> SiteOutcom
         return SiteOutcome.NO_MOTION
     if motion.parallax_px < options.min_parallax_px:
         return SiteOutcome.NO_BASELINE
-    return SiteOutcome.NO_MOTION if not motion.converged or np.count_nonzero(motion.inliers) < min_inliers else None
+    # checked after the baseline, without which depths are arbitrary and the iteration may not converge
+    if not motion.converged or np.count_nonzero(motion.inliers) < min_inliers:
+        return SiteOutcome.NO_MOTION
+    return None
 
 
 def match_structure(scene: LandingScene, motion: CameraMotion, options: HdaOptions) -> Matches:

@@ -67,21 +67,21 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Raster, R
     starts = [_square_starts(extent, side) for extent in shape]
     # random numbers from which the kernel selects three cells in each trial
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
-    planes = kernels.footprint_planes(
-        ground.elevation_m, starts[0], starts[1], side, max(side * side // 2, 4), triples, options.refine_planes
-    )
-    planes[..., 1:] /= ground.cell_m
+    min_cells = max(side * side // 2, 4)  # a plane through three cells has no residuals
+    planes = kernels.footprint_planes(ground.elevation_m, *starts, side, min_cells, triples, options.refine_planes)
     if planes.size == 0:
         return np.full(shape, np.nan), np.full(shape, np.nan)
+    heights, column_slopes, row_slopes = np.moveaxis(planes, -1, 0)
+    column_slopes, row_slopes = column_slopes / ground.cell_m, row_slopes / ground.cell_m
     centres = [start + 0.5 * (side - 1) for start in starts]
     rows, columns = (_interpolation_weights(centre, extent) for centre, extent in zip(centres, shape, strict=True))
-    smooth = _interpolate(planes[..., 0], rows, columns)
+    smooth = _interpolate(heights, rows, columns)
     # Along an axis with a single footprint, extrapolate with the slope of its plane.
-    for axis, centre in enumerate(centres):
-        if len(centre) == 1:
-            offsets = np.expand_dims(np.arange(shape[axis]) - centre[0], 1 - axis)
-            smooth = smooth + _interpolate(planes[..., 2 - axis], rows, columns) * ground.cell_m * offsets
-    slopes = np.arctan(np.hypot(planes[..., 1], planes[..., 2]))
+    for axis, axis_slopes in enumerate((row_slopes, column_slopes)):
+        if len(centres[axis]) == 1:
+            offsets = np.expand_dims(np.arange(shape[axis]) - centres[axis][0], 1 - axis)
+            smooth = smooth + _interpolate(axis_slopes, rows, columns) * ground.cell_m * offsets
+    slopes = np.arctan(np.hypot(column_slopes, row_slopes))
     return smooth, np.maximum(_interpolate(slopes, rows, columns), 0.0)
 
 
@@ -207,7 +207,8 @@ def classify_footprints(
     max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
     if max_roughness_m <= 0.0:
         return np.full(shape, Safety.HAZARD, dtype=np.uint8)
-    radius_cells = 0.5 * options.lander_diameter_m / ground.cell_m
+    # at least the four neighbours of the centre: a plane needs more than three cells
+    radius_cells = max(0.5 * options.lander_diameter_m / ground.cell_m, 1.0)
     step = max(int(2.0 * radius_cells / POINTS_PER_DIAMETER), 1)
     fit_offsets = disc_cells(radius_cells)
     fit_offsets = fit_offsets[np.all(fit_offsets % step == 0, axis=1)].copy()

@@ -26,8 +26,14 @@ ITERATIONS = 300
 #: Step length (rotation in radians, translation as a fraction of the median depth) below which the iteration has
 #: converged: at `START_SCALES_PX`, and at the final scale `HdaOptions.robust_px`.
 START_TOLERANCE, TOLERANCE = 1e-4, 1e-9
+#: Angle between the optical axis and the normals of the inclined planes of `range_starts`. Of 16 rendered pairs over
+#: rocks and slopes, with 2 to 4 deg of rotation, 11 were solved from the plane perpendicular to the axis alone, and all
+#: from the best of the five planes.
+START_TILT_RAD = float(np.deg2rad(8.0))
 #: Largest relative deviation of an inlier's inverse depth from the plane fit.
 MAX_INVERSE_DEPTH_FRACTION = 0.6
+#: Number of fits of this plane; each excludes the features that deviate from the one before.
+_PLANE_FITS = 3
 
 
 @dataclass(frozen=True)
@@ -78,12 +84,6 @@ class MotionStart:
 
     second_from_first: RigidTransform
     depths: Vector
-
-
-#: Angle between the optical axis and the normals of the inclined planes of `range_starts`. Of 16 rendered pairs over
-#: rocks and slopes, with 2 to 4 deg of rotation, 11 were solved from the plane perpendicular to the axis alone, and all
-#: from the best of the five planes.
-START_TILT_RAD = float(np.deg2rad(8.0))
 
 
 def range_starts(coordinates: Points2, range_m: float) -> tuple[MotionStart, ...]:
@@ -169,8 +169,9 @@ def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_resid
     """
     design = np.column_stack([first, np.ones(len(first))])
     mask = has_small_residual & (inverse_depths > 0.0)
-    for _ in range(3):
-        if mask.sum() < 4:
+    for _ in range(_PLANE_FITS):
+        # three features have no deviations from a plane
+        if mask.sum() <= 3:
             return mask
         plane = design @ np.linalg.lstsq(design[mask], inverse_depths[mask], rcond=None)[0]
         deviations = np.abs(inverse_depths - plane)

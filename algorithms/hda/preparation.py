@@ -51,7 +51,7 @@ def resample_second(views: Views, second_from_first: RigidTransform, depth_m: fl
     first, second = views
     first_from_second = second_from_first.rotation.inv()
     origin = first_from_second.apply(np.array(second_from_first.translation))
-    rays = first_from_second.apply(second.camera.rays(second.camera.border(16))[1])
+    rays = first_from_second.apply(second.camera.rays(second.camera.border(steps=16))[1])
     second_depth_m = depth_m + float(origin[2])
     if not (second_depth_m > 0.0 and np.all(rays[:, 2] > 0.0)):
         return views, second_from_first

@@ -155,7 +155,8 @@ def plane_normal(points: Points3, seed: int) -> Vector3:
     inliers = points[distances[:, best] <= INLIER_DEVIATIONS * sigma]
     normal = normals[best]
     if len(inliers) >= 3:
-        normal = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)[2][2]
+        *_, principal_axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
+        normal = principal_axes[-1]  # of least variance
     return np.asarray(-np.sign(normal @ points.mean(axis=0)) * normal)
 
 

@@ -17,6 +17,14 @@ from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.preparation import prepare_views
 from marsyard.algorithms.hda.scene import CameraView, Views, points_at_depth, project_points, undistort
 
+#: Minimum number of grid points along the width of the narrowest hazard (option `refine_grid`): a map cell is then at
+#: most a sixth of this width, and its averages reduce the height of the hazard by less than a tenth.
+GRID_POINTS_PER_HAZARD = 6
+#: Offsets of the pixels matched around the laser spot; their median depth is the depth of the spot.
+SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
+#: Minimum number of matches in the spot.
+MIN_SPOT_MATCHES = 5
+
 
 class MatchStatus(IntEnum):
     """Result of a structure match: accepted, or the failed check.
@@ -59,11 +67,6 @@ class Matches:
 def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[float, float]:
     """Depth range of the features, widened by the fraction `margin`."""
     return (1.0 - margin) * depth_range_m[0], (1.0 + margin) * depth_range_m[1]
-
-
-#: Minimum number of grid points along the width of the narrowest hazard (option `refine_grid`): a map cell is then at
-#: most a sixth of this width, and its averages reduce the height of the hazard by less than a tenth.
-GRID_POINTS_PER_HAZARD = 6
 
 
 def grid_spacing_px(view: CameraView, depth_range_m: tuple[float, float], options: HdaOptions) -> int:
@@ -211,12 +214,6 @@ def dense_structure(
     spacing = grid_spacing_px(views[0], depth_range_m, options)
     pixels = pixel_lattice(views[0].camera.size, spacing, options.search_half_px + 1)
     return match_pixels(views, second_from_first, pixels, depth_bounds(depth_range_m, options.depth_margin), options)
-
-
-#: Offsets of the pixels matched around the laser spot; their median depth is the depth of the spot.
-SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
-#: Minimum number of matches in the spot.
-MIN_SPOT_MATCHES = 5
 
 
 def scale_factor(

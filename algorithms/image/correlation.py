@@ -13,6 +13,9 @@ from marsyard.algorithms.arrays import Raster
 from marsyard.algorithms.image.kernels import correlation as kernels
 from marsyard.algorithms.image.peaks import Peak
 
+#: Search radius around a candidate of the coarser level, pixels: one pixel for its error and one for sampling.
+SEARCH_RADIUS_PX = 2
+
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
     """Cross-correlate without normalisation, by FFT: sums of products at every position where the template fits.
@@ -32,16 +35,12 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
     left pixel at (i, j) of the window; the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1] and decrease
     with a contrast difference, unlike normalised correlation. Zero if both patches are uniform.
     """
-    scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
+    max_abs = max(float(np.abs(template).max()), float(np.abs(window).max()))
     a = template - template.mean(dtype=np.float64)
     b = np.ascontiguousarray(window - window.mean(dtype=np.float64))
     cross = np.ascontiguousarray(cross_sums(a, b))
-    min_energy = kernels.FLAT_ENERGY * template.size * scale * scale
+    min_energy = _flat_energy(template, max_abs)
     return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), min_energy))
-
-
-#: Search radius around a candidate of the coarser level, pixels: one pixel for its error and one for sampling.
-SEARCH_RADIUS_PX = 2
 
 
 def normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:

@@ -32,7 +32,8 @@ def remove_frame_transfer(signal: Raster, calibration: DetectorCalibration, rows
         return signal
     row_gain = calibration.exposure_s + 0.5 * (n - 1) * (a + b) - n * b
     sum_gain = n * (a - b)
-    # the recursion's factor 1 - sum_gain / row_gain must lie between -1 and 3
+    # The factor of the recursion, 1 - sum_gain / row_gain, must lie between -1 and 3. Otherwise errors grow with
+    # alternating sign, or by more than a factor of 3 per row.
     if row_gain <= 0.5 * abs(sum_gain):
         raise ValueError(
             f"an exposure of {calibration.exposure_s} s is too short to invert a frame transfer of "

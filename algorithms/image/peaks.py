@@ -9,8 +9,6 @@ from marsyard.algorithms.arrays import Raster, Vector2
 
 #: Row and column offsets of 3 x 3 pixels from the centre.
 _ROW_OFFSETS, _COLUMN_OFFSETS = np.mgrid[-1.0:2.0, -1.0:2.0]
-
-
 #: Fraction of a peak's height at which its width is measured.
 _WIDTH_LEVEL = 0.75
 
@@ -41,6 +39,7 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
     if peak.on_border:
         return np.zeros(2)
     z = surface[peak.row - 1 : peak.row + 2, peak.column - 1 : peak.column + 2]
+    # closed form of the least-squares fit to 3 x 3 values
     gradient = np.array([np.sum(z * _ROW_OFFSETS), np.sum(z * _COLUMN_OFFSETS)]) / 6.0
     # second derivatives of the quadratic along rows, along columns, and mixed
     rr = float(np.sum(z * (_ROW_OFFSETS**2 - 2.0 / 3.0)))

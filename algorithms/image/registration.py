@@ -98,9 +98,9 @@ def register_template(
     spline = window if isinstance(window, WindowSpline) else build_spline(window, corner, len(template))
     low = np.array(spline.start)
     start = corner - low + half
-    bounds = (limits.shift_px, limits.stretch, limits.steps)
+    max_values = (limits.shift_px, limits.stretch, limits.steps)
     converged, row, column, score = kernels.register(
-        template, spline.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, MIN_PIVOT
+        template, spline.coefficients, *start, _ORDERS[warp], max_values, REGISTRATION_TOLERANCE_PX, MIN_PIVOT
     )
     return Registration(np.array([row, column]) - half + low, score) if converged else None
 
@@ -117,11 +117,14 @@ def similarity_patch(
 
     Raises ValueError if the centre is outside the image.
     """
-    linear = np.zeros((2, 5))
-    linear[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
-    linear /= magnification
-    margin = int(np.ceil(0.5 * (side - 1) * np.abs(linear).sum(axis=1).max())) + MARGIN_PX
-    position = centre[::-1]
+    position = centre[::-1]  # row and column
+    if not (np.all(position >= 0.0) and np.all(position <= np.array(image.shape) - 1.0)):
+        raise ValueError(f"the centre of a patch, {centre}, is outside the image of {image.shape[::-1]} pixels")
+    # coefficients of y, x, and of the quadratic terms, which are zero
+    warp = np.zeros((2, 5))
+    warp[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    warp /= magnification
+    margin = int(np.ceil(0.5 * (side - 1) * np.abs(warp).sum(axis=1).max())) + MARGIN_PX
     start = np.floor(position).astype(int) - margin
     stop = start + 2 * margin + 2
     valid_region = image[max(start[0], 0) : max(stop[0], 0), max(start[1], 0) : max(stop[1], 0)]
@@ -131,6 +134,5 @@ def similarity_patch(
     region = np.pad(valid_region, padding, mode="reflect") if np.any(padding) else valid_region
     values = np.empty(side * side)
     row, column = position - start
-    if not kernels.sample(spline_coefficients(region), side, row, column, linear, values):
-        raise ValueError(f"the centre of a patch, {centre}, is outside the image of {image.shape[::-1]} pixels")
+    kernels.sample(spline_coefficients(region), side, row, column, warp, values)
     return values.reshape(side, side)

@@ -61,11 +61,10 @@ class FeatureEstimator(InertialEstimator):
     def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Store the altitude, which determines the scale at which an image is matched.
 
-        An altitude is ignored if its time is outside the inertial data.
+        An altitude is ignored if its time is outside the inertial data, or if it is not positive.
         """
-        if not self._filter.is_stored(measurement.time_s):
-            return
-        self._altitude_m = measurement.altitude_m
+        if self._filter.is_stored(measurement.time_s) and measurement.altitude_m > 0.0:
+            self._altitude_m = measurement.altitude_m
 
     def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Estimate the pose from features, and update the position. Without a pose, return the propagated state."""

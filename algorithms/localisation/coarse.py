@@ -117,10 +117,10 @@ def _accept_best_candidate(
     if not ranked or ranked[0].count < max(options.min_consistent_patches, 1):
         return CoarseRefusal.NO_CONSENSUS
     best = ranked[0]
-    distances = [float(np.linalg.norm(other.offset_m - best.offset_m)) for other in ranked]
     # candidates that converged to the same offset are not alternatives
-    others = [c.support for c, d in zip(ranked, distances, strict=True) if d > 2.0 * options.relief_tolerance_m]
-    second = max(others, default=0.0)
+    min_distance_m = 2.0 * options.relief_tolerance_m
+    others = [other for other in ranked if np.linalg.norm(other.offset_m - best.offset_m) > min_distance_m]
+    second = max((other.support for other in others), default=0.0)
     if second > options.max_second_support * best.support or best.repetition > options.alternative_score:
         return CoarseRefusal.AMBIGUOUS
     if np.linalg.norm(best.offset_m) > radius * grid.pixel_m - options.relief_tolerance_m:

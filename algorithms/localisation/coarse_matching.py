@@ -27,6 +27,10 @@ _PATCH_SPACING = 0.75
 _FOOTPRINT_FRACTION = 0.4
 #: Minimum standard deviation of a patch relative to its mean: below it, only noise and rounding remain (assumed).
 _MIN_PATCH_CONTRAST = 1e-3
+#: Fraction of valid pixels above which a square counts as complete: the mean of ones has rounding errors.
+_COMPLETE = 0.9999
+#: Correlation over offsets (rows, columns).
+Surface = Float[np.ndarray, "_ _"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ def select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, opt
     values = np.where(rectified.valid, rectified.values - np.float32(mean), np.float32(0.0))
     interest = harris_interest(*structure_tensor(values, _CONTRAST_SUPPORT_PX))
     contrasts = cv2.boxFilter(interest.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0))
-    filled = cv2.boxFilter(rectified.valid.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0)) > 0.9999
+    filled = cv2.boxFilter(rectified.valid.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0)) > _COMPLETE
     rows = np.arange(0, values.shape[0] - side + 1, _PATCH_STEP_PX)
     columns = np.arange(0, values.shape[1] - side + 1, _PATCH_STEP_PX)
     map_columns, map_rows = columns + rectified.corner[0], rows + rectified.corner[1]
@@ -92,10 +96,6 @@ def correlate_patch(patch: ImagePatch, appearance: Raster, radius: int) -> Float
     steps = np.arange(-radius, radius + 1)
     surface[steps[:, np.newaxis] ** 2 + steps**2 > radius**2] = -1.0
     return np.where(np.isfinite(surface), surface, np.float32(-1.0))
-
-
-#: Correlation over offsets (rows, columns).
-Surface = Float[np.ndarray, "_ _"]
 
 
 @dataclass(frozen=True)

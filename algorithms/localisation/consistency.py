@@ -27,7 +27,7 @@ from jaxtyping import Float, Int
 from scipy.special import bdtrc, chdtri
 
 from marsyard.algorithms.arrays import Flags, Points2, Points3, Vector
-from marsyard.algorithms.localisation.inertial_state import ATTITUDE, POSITION, VELOCITY
+from marsyard.algorithms.localisation.inertial_state import ATTITUDE, MOTION, POSITION, VELOCITY
 from marsyard.algorithms.localisation.matrices import cross_matrix
 
 #: Coordinates of an offset.
@@ -123,12 +123,12 @@ def _state_jacobian(patches: PatchGeometry) -> Float[np.ndarray, "m 9"]:
     count, tangents = len(patches.images), _tangents(patches)
     # horizontal shift of a patch by a displacement (east, north, up) of its line of sight
     project = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), tangents[:, :, np.newaxis]], axis=2)
-    jacobian = np.zeros((count, _AXES, 9))
+    jacobian = np.zeros((count, _AXES, MOTION.stop))
     jacobian[:, :, POSITION] = np.eye(2, 3)
     jacobian[:, :, VELOCITY] = -patches.ages_s[:, np.newaxis, np.newaxis] * np.eye(2, 3)
     # e x d = -[d]x e
     jacobian[:, :, ATTITUDE] = project @ -cross_matrix(patches.lines_m)
-    return jacobian.reshape(-1, 9)
+    return jacobian.reshape(-1, MOTION.stop)
 
 
 def _overlap(patches: PatchGeometry) -> Float[np.ndarray, "n n"]:

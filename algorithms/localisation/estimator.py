@@ -186,12 +186,11 @@ class MapRelativeEstimator:
         last_s, limit_s = self._last_update_s, self.options.max_update_age_s
         if last_s is None or time_s - last_s > limit_s:
             return PositionEstimate(PositionOutcome.UNCERTAIN, time_s, details=details)
-        position, velocity, attitude, covariance = self._filter.estimate(time_s)
-        if float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) > self.options.max_position_sd_m:
+        motion = self._filter.estimate(time_s)
+        horizontal = motion.covariance[:2, :2]
+        if float(np.sqrt(np.linalg.eigvalsh(horizontal)[-1])) > self.options.max_position_sd_m:
             return PositionEstimate(PositionOutcome.UNCERTAIN, time_s, details=details)
-        return PositionEstimate(
-            PositionOutcome.VALID, time_s, position, velocity, attitude, covariance, details=details
-        )
+        return PositionEstimate(PositionOutcome.VALID, time_s, *motion, details=details)
 
     def _height_above_ground(self, time_s: float) -> float | None:
         """Height above the ground at a time, from the last altitude and the inertial vertical velocity."""

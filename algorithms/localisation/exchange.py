@@ -19,6 +19,13 @@ from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 
+#: JSON file of a map.
+MAP_FILE = "map.json"
+#: Key of the attitude in an answer.
+_ATTITUDE = "world_from_body_xyzw"
+#: Largest difference of a quaternion's norm from 1 in an answer.
+_MAX_NORM_ERROR = 1e-3
+
 
 def check_estimate(answer: Any, span_s: tuple[float, float]) -> PositionEstimate:
     """Validate a `PositionEstimate`; return a copy with plain arrays.
@@ -55,14 +62,6 @@ def check_estimate(answer: Any, span_s: tuple[float, float]) -> PositionEstimate
         velocity_m_s=check_numbers("velocity_m_s", answer.velocity_m_s, (3,)),
         covariance=covariance,
     )
-
-
-#: JSON file of a map.
-MAP_FILE = "map.json"
-#: Key of the attitude in an answer.
-_ATTITUDE = "world_from_body_xyzw"
-#: Largest difference of a quaternion's norm from 1 in an answer.
-_MAX_NORM_ERROR = 1e-3
 
 
 def write_map(folder: Path, map_product: MapProduct) -> None:

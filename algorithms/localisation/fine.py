@@ -29,6 +29,8 @@ from marsyard.sim.camera import CameraModel
 
 #: Assumed standard deviation of a displacement per axis, working pixels, for the weight of the prior.
 _NOISE_PX = 0.3
+#: Minimum standard deviation of the position in this prior, metres: it must be positive.
+_MIN_POSITION_SD_M = 1e-3
 #: Residuals up to this multiple of the fine stage's limit are accepted in an acquisition step, whose linear model has
 #: an error of some tenths of a pixel.
 _ACQUISITION_TOLERANCE = 1.5
@@ -93,7 +95,7 @@ def match_landmarks(
     height_m = max(float(image.world_camera.c[2]) - ground_m, 1.0)
     factor = binning_factor(image, height_m, map_product.pixel_m)
     # a prior with the state's attitude would remove the landmarks that show its error; the filter tests the attitude
-    prior_sd = np.append(np.maximum(position_sd_m, 1e-3), np.full(3, options.fit_attitude_sd_rad))
+    prior_sd = np.append(np.maximum(position_sd_m, _MIN_POSITION_SD_M), np.full(3, options.fit_attitude_sd_rad))
     sigma_px = np.hypot(
         float(np.max(position_sd_m)) / (height_m * image.camera.pixel_angle_rad),
         options.attitude_sd_rad / image.camera.pixel_angle_rad,

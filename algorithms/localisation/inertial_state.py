@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.arrays import Vector3
 from marsyard.algorithms.localisation.matrices import cross_matrix, left_jacobian, symmetrise
 
+#: One degree per hour, rad/s; one degree per square root of an hour, rad/sqrt(s); unit of accelerations in data sheets.
 _DEG_H = np.radians(1.0) / 3600.0
 _DEG_SQRT_H = np.radians(1.0) / 60.0
 _STANDARD_GRAVITY_M_S2 = 9.80665
@@ -95,8 +96,6 @@ GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
 #: Blocks of the motion: position, velocity and attitude.
 MOTION = slice(POSITION.start, ATTITUDE.stop)
 ERRORS = 15  #: Number of errors.
-
-
 ErrorVector = Float[np.ndarray, "15"]
 ErrorMatrix = Float[np.ndarray, "15 15"]
 

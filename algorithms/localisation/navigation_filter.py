@@ -16,7 +16,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation import state_updates as updates
 from marsyard.algorithms.localisation.inertial_state import (
     ERRORS,
-    GYRO_BIAS,
+    MOTION,
     ImuErrorModel,
     IncrementHistory,
     NavigationState,
@@ -61,6 +61,15 @@ class _Checkpoint:
     updates: int
 
 
+class EstimatedMotion(NamedTuple):
+    """Motion of the body frame, and the covariance of its errors; the fields are those of `PositionEstimate`."""
+
+    position_m: Float[np.ndarray, "3"]
+    velocity_m_s: Float[np.ndarray, "3"]
+    world_from_body: Rotation
+    covariance: Float[np.ndarray, "9 9"]
+
+
 class LocalisationFilter:
     """Error-state extended Kalman filter of 15 errors for map-relative localisation.
 
@@ -81,8 +90,8 @@ class LocalisationFilter:
         """Create the filter from a state of inertial navigation, with biases of zero; `imu`: errors of the unit."""
         imu = ImuErrorModel() if imu is None else imu
         covariance = np.zeros((ERRORS, ERRORS))
-        covariance[: GYRO_BIAS.start, : GYRO_BIAS.start] = initial.covariance
-        covariance[GYRO_BIAS.start :, GYRO_BIAS.start :] = np.diag(imu.initial_bias_variances)
+        covariance[MOTION, MOTION] = initial.covariance
+        covariance[MOTION.stop :, MOTION.stop :] = np.diag(imu.initial_bias_variances)
         position, velocity = initial.position_m, initial.velocity_m_s
         zero, attitude = np.zeros(3), initial.world_from_body
         state = NavigationState(initial.time_s, position, velocity, attitude, zero, zero, covariance)
@@ -138,13 +147,11 @@ class LocalisationFilter:
             raise ValueError(f"time {time_s:.4f} s is outside of the stored history; allowed: {allowed}")
         return self._propagate_and_update(self._checkpoints[self._last_checkpoint_before(time_s)], time_s)[-1].state
 
-    def estimate(
-        self, time_s: float
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Rotation, Float[np.ndarray, "9 9"]]:
-        """Compute position, velocity, attitude, and the covariance of their errors; ValueError as `state_at`."""
+    def estimate(self, time_s: float) -> EstimatedMotion:
+        """Compute the motion at a time; ValueError as `state_at`."""
         state = self.state_at(time_s)
-        covariance = state.covariance[: GYRO_BIAS.start, : GYRO_BIAS.start]
-        return state.position_m, state.velocity_m_s, state.world_from_body, covariance
+        covariance = state.covariance[MOTION, MOTION]
+        return EstimatedMotion(state.position_m, state.velocity_m_s, state.world_from_body, covariance)
 
     def update_position(
         self, time_s: float, horizontal_position_m: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]

@@ -146,7 +146,9 @@ class LvsOptions:
             raise ValueError(f"template_px is {self.template_px}; it must be odd and at least 5")
         if not 0.0 < self.max_off_nadir_rad < np.pi / 2:
             raise ValueError(f"max_off_nadir_rad is {self.max_off_nadir_rad}; it must lie between 0 and pi/2")
-        counts = ("coarse_binning", "coarse_images", "patches_per_image", "max_landmarks", "landmark_spacing_px")
-        for name in counts:
+        for name in (
+            "coarse_binning", "coarse_images", "patches_per_image", "max_landmarks", "acquisition_landmarks",
+            "landmark_spacing_px", "coarse_altitudes",
+        ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")

@@ -66,7 +66,7 @@ def fit_pose(
     values = displacements_px / noise_px
     limit2 = (max_residual_px / noise_px) ** 2
     weights = np.ones(len(values))
-    mu = 0.0
+    mu = 0.0  # set after the first iteration, which has equal weights
     solution = np.zeros(6)
     for _ in range(_MAX_ITERATIONS):
         weighted = weights[:, np.newaxis, np.newaxis] * design

@@ -90,6 +90,7 @@ def register_image(
 def flatten(raster: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
     """Return the relative deviation of a raster from the blurred raster: without vignetting, haze and large shadows."""
     blurred = cv2.GaussianBlur(raster, (0, 0), _FLATTEN_PX, borderType=cv2.BORDER_REFLECT)
+    # the lower limit of the divisor is relative to the brightest part; the constant prevents a division of zero by zero
     return np.asarray(raster / np.maximum(blurred, np.float32(1e-6) + np.abs(blurred).max() * np.float32(1e-3)) - 1.0)
 
 
@@ -101,11 +102,11 @@ def solve_pose(image: PosedImage, factor: int, features: MapFeatures, options: L
     matches = match_with_map(image.bin(factor), features, options)
     if matches is None:
         return None
-    points, pixels = matches
+    points, coordinates = matches
     origin = points.mean(axis=0)
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points - origin,
-        pixels,
+        coordinates,
         np.eye(3),
         None,
         # two pixels of the binned image, in normalised coordinates
@@ -142,22 +143,22 @@ def match_with_map(image: PosedImage, features: MapFeatures, options: LvsOptions
 
 
 def _solve_by_homography(
-    image: PosedImage, factor: int, points: Points3, pixels: Points2, options: LvsOptions
+    image: PosedImage, factor: int, points: Points3, coordinates: Points2, options: LvsOptions
 ) -> FeaturePose | None:
-    """Solve the pose from the matches that agree with a homography; None if they are too few."""
+    """Solve the pose from the matches (see `match_with_map`) that agree with a homography; None if they are too few."""
     origin = points.mean(axis=0)
     relative = points - origin
-    pixel = factor * image.camera.pixel_angle_rad
-    # coordinates in pixels and of order 1000 m
+    pixel_rad = factor * image.camera.pixel_angle_rad
+    # from horizontal positions, of order 1000 m, to pixels of the binned image
     homography, mask = cv2.findHomography(
-        relative[:, :2], pixels / pixel, cv2.RANSAC, _MAX_RESIDUAL_PX, maxIters=20000, confidence=0.9999
+        relative[:, :2], coordinates / pixel_rad, cv2.RANSAC, _MAX_RESIDUAL_PX, maxIters=20000, confidence=0.9999
     )
     inliers = np.zeros(len(points), dtype=np.bool_) if homography is None else mask.ravel() > 0
     # different features of the image can match one feature of the map
     count = len(np.unique(points[inliers], axis=0))
     if count < options.min_matches:
         return None
-    found, rotation, translation = cv2.solvePnP(relative[inliers], pixels[inliers], np.eye(3), None)
+    found, rotation, translation = cv2.solvePnP(relative[inliers], coordinates[inliers], np.eye(3), None)
     return _to_pose(image, rotation, translation, origin, count) if found else None
 
 

@@ -31,6 +31,8 @@ GroundHeight = tuple[float, Float[np.ndarray, "2"]]
 GroundModel = Callable[[Float[np.ndarray, "2"]], GroundHeight] | GroundHeight
 #: Columns of the landmarks' Jacobian: position, attitude, common error of the points.
 _POSITION, _ATTITUDE, _COMMON = slice(0, 3), slice(3, 6), slice(6, 9)
+#: Unknowns of an update by landmarks: the errors of the state, and the common error (east, north, up).
+_UNKNOWNS = ERRORS + 3
 #: Independent components of the state that one image measures: position and attitude.
 _OBSERVED = 6
 #: Limits of the updates, all assumed. Probabilities to reject a correct position, altitude or landmark by its
@@ -190,7 +192,7 @@ def update_landmarks(
     innovation_squares = _normalise(start.residuals, start.noise + factors @ factors.transpose(0, 2, 1))
     candidates = start.visible & (innovation_squares < chdtri(2, FALSE_REJECTION))
     limit = float(chdtri(2, OUTLIER_PROBABILITY))
-    whitened = np.zeros(ERRORS + 3)
+    whitened = np.zeros(_UNKNOWNS)
     if candidates.any():
         inliers, whitened = _estimate_robustly(problem, candidates, limit)
     else:
@@ -229,7 +231,7 @@ def _test_rigid_motion(
     for variances in (_FREE_VARIANCES, alignment):
         covariance = state.covariance + np.diag(variances)
         problem = _LandmarkProblem(replace(state, covariance=covariance), measurement)
-        solution = problem.solve(weights, np.zeros(ERRORS + 3))
+        solution = problem.solve(weights, np.zeros(_UNKNOWNS))
         costs.append(float(solution.whitened @ solution.whitened + solution.squares @ weights))
     residuals = np.where(solution.linearisation.visible[:, None], solution.residuals, np.nan)
     return costs[1] - costs[0], residuals
@@ -251,11 +253,11 @@ class _LandmarkProblem:
 
     def __init__(self, state: NavigationState, measurement: LandmarkMeasurement) -> None:
         self._state, self._measurement = state, measurement
-        self._root = np.zeros((ERRORS + 3, ERRORS + 3))
+        self._root = np.zeros((_UNKNOWNS, _UNKNOWNS))
         self._root[:ERRORS, :ERRORS] = square_root(state.covariance)
         self._root[ERRORS:, ERRORS:] = np.diag(measurement.common_sd_m)
         #: rows of the square root that the landmarks observe
-        self.factor = self._root[np.r_[POSITION, ATTITUDE, ERRORS : ERRORS + 3]]
+        self.factor = self._root[np.r_[POSITION, ATTITUDE, ERRORS:_UNKNOWNS]]
 
     def errors(self, whitened: Float[np.ndarray, "18"]) -> Float[np.ndarray, "15"]:
         """Compute the errors of the state."""
@@ -279,12 +281,12 @@ class _LandmarkProblem:
         self, weights: Float[np.ndarray, "n"], whitened: Float[np.ndarray, "18"], iterations: int = 4
     ) -> _Solution:
         """Estimate the whitened errors from landmarks with these weights, by Gauss-Newton from a first estimate."""
-        identity = np.eye(ERRORS + 3)
+        identity = np.eye(_UNKNOWNS)
         linearisation, residuals = self.linearise(whitened)
         for _ in range(iterations):
             factors = linearisation.jacobian @ self.factor
             weighted = weights[:, None, None] * np.linalg.solve(linearisation.noise, factors)
-            flat, flat_weighted = factors.reshape(-1, ERRORS + 3), weighted.reshape(-1, ERRORS + 3)
+            flat, flat_weighted = factors.reshape(-1, _UNKNOWNS), weighted.reshape(-1, _UNKNOWNS)
             information = symmetrise(identity + flat.T @ flat_weighted)
             target = flat_weighted.T @ (residuals.reshape(-1) + flat @ whitened)
             previous, whitened = whitened, np.linalg.solve(information, target)
@@ -302,7 +304,7 @@ def _estimate_robustly(
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "18"]]:
     """Find the inliers among the candidates, and the whitened errors, by graduated non-convexity (Yang, Eq. 14)."""
     weights = candidates.astype(np.float64)
-    solution = problem.solve(weights, np.zeros(ERRORS + 3))
+    solution = problem.solve(weights, np.zeros(_UNKNOWNS))
     largest = float(solution.squares[candidates].max())
     if largest < limit:
         return candidates, solution.whitened

@@ -66,13 +66,9 @@ class NavigationOptions:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if (
-                name in ("half_width_m", "climb_m", "tilt_deg", "roughness_m", "lookahead_m", "max_curvature_per_m")
-                and not 0.0 < value < np.inf
-            ):
-                raise ValueError(f"{name} is {value}; it must be positive")
-            if not 0.0 <= value < np.inf:
-                raise ValueError(f"{name} is {value}; it must not be negative")
+            can_be_zero = name in ("margin_m", "turn_cost_m", "bend_cost_m2")
+            if not (0.0 < value < np.inf or (can_be_zero and value == 0.0)):
+                raise ValueError(f"{name} is {value}; it must {'not be negative' if can_be_zero else 'be positive'}")
 
     @property
     def limits(self) -> GroundLimits:
@@ -113,9 +109,9 @@ def navigate(
     - goal_m: Position (east, north) for the rover's origin, in the estimated world frame
     - step_m: Maximum path length to drive in this step
     """
-    forward = world_from_rover.rotation.as_matrix()[:2, 0]
+    east, north, _ = world_from_rover.rotation.as_matrix()[:, 0]  # the rover's x axis, forward
     position = world_from_rover.translation[:2]
-    world_from_forward = _rotation_matrix(np.arctan2(forward[1], forward[0]))
+    world_from_forward = _rotation_matrix(np.arctan2(north, east))
     goal = np.asarray((goal_m - position) @ world_from_forward)
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, ())

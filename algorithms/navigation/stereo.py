@@ -24,9 +24,11 @@ _WHITE_PERCENTILE = 99.5
 _MAX_FIELD_RAD = float(np.radians(55.0))
 #: Window of dense matching and of feature matching, pixels.
 _BLOCK_PX, _FEATURE_PX = 9, 11
-#: Dense matching (`cv2.StereoBM`): minimum texture, uniqueness in %, left-right tolerance in px, speckles in px and
-#: their disparity range in units of a sixteenth of a pixel.
-_TEXTURE, _UNIQUENESS, _LEFT_RIGHT_PX, _SPECKLE_PX, _SPECKLE_RANGE = 10, 15, 1, 100, 8
+#: Dense matching (`cv2.StereoBM`): minimum texture, minimum margin of the best match in %, and maximum difference
+#: between the disparities from left to right and from right to left, pixels.
+_TEXTURE, _UNIQUENESS, _LEFT_RIGHT_PX = 10, 15, 1
+#: Largest area of a speckle, which has no match, in pixels, and disparity range within it, sixteenths of a pixel.
+_SPECKLE_PX, _SPECKLE_RANGE = 100, 8
 #: OpenCV's unit of disparity, pixels, and the step of its number of disparities.
 _DISPARITY_UNIT, _DISPARITY_STEP = 1.0 / 16.0, 16
 #: Maximum distance of a feature match from its epipolar line, and maximum forward-backward error, pixels.
@@ -62,9 +64,11 @@ class RectifiedPair:
         # the field of view at the ends of the camera's central row and column
         columns, rows = left.size
         centre = np.array(left.image_centre)
-        edges = np.array([[0.0, centre[1]], [columns - 1.0, centre[1]], [centre[0], 0.0], [centre[0], rows - 1.0]])
-        angles = np.minimum(np.arccos(np.clip(left.rays(edges)[1] @ axis, -1.0, 1.0)), _MAX_FIELD_RAD)
-        half_width, half_height = (float(np.tan(angles[ends].max())) * focal_px for ends in ([0, 1], [2, 3]))
+        row_ends = [[0.0, centre[1]], [columns - 1.0, centre[1]]]
+        column_ends = [[centre[0], 0.0], [centre[0], rows - 1.0]]
+        cosines = left.rays(np.array(row_ends + column_ends))[1] @ axis
+        angles = np.minimum(np.arccos(np.clip(cosines, -1.0, 1.0)), _MAX_FIELD_RAD).reshape(2, 2)
+        half_width, half_height = (float(np.tan(ends.max())) * focal_px for ends in angles)
         size = 2 * int(np.ceil(half_width)), 2 * int(np.ceil(half_height))
         camera = Cahv.from_axes((focal_px, focal_px), size, axis=axis, right=baseline_direction, centre=left.c)
         white_counts = max(float(np.percentile(pair.left, _WHITE_PERCENTILE)), 1.0)
@@ -95,8 +99,8 @@ class RectifiedPair:
         centre, focal = np.array(self.camera.image_centre), self.camera.focal_lengths[0]
         axes = np.stack([self.camera.right, self.camera.down, self.camera.a])
         depth = self.disparity_px_m / disparity_px
+        # derivatives of (right, down, depth) with respect to (u, v of the left pixel, disparity)
         jacobian = np.zeros((len(pixels), 3, 3))
-        # columns: u and v of the left pixel, disparity
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = depth / focal
         slopes = np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))])
         jacobian[:, :, 2] = -slopes * (depth / disparity_px)[:, None]
@@ -175,5 +179,6 @@ def _resample(
     """Resample an image to the rectified camera's directions; 0 outside of the image."""
     directions = rectified.rays(rectified.pixel_grid())[1]
     pixels, visible = camera.project(camera.c + directions)
+    # the pixel (-10, -10) is outside of every image
     maps = np.where(visible[..., None], pixels, -10.0).astype(np.float32)
     return np.asarray(cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC, borderValue=0))

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float64
 
-from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
+from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector, Vector2
 
 #: Side of a cell (GESTALT: 0.2 m) and half the side of the map (assumed), metres.
 CELL_M, HALF_SIDE_M = 0.2, 20.0
@@ -30,7 +31,7 @@ _MIN_MAPPED_FRACTION = 0.8
 class GroundLimits:
     """Limits of the ground that the rover may drive over; those of MER's flight parameters are not published (assumed).
 
-    - radius_m: radius of the disc around the rover's footprint
+    - radius_m: radius of the disc around the rover's footprint, at least a cell
     - climb_m: maximum height above, or depth below, the fitted plane
     - tilt_rad: maximum tilt of the plane
     - roughness_m: maximum standard deviation of the heights from the plane
@@ -46,6 +47,7 @@ class GroundLimits:
 class Goodness:
     """Goodness of the ground at each cell of a map.
 
+    - corner_m: east and north of the centre of cell (0, 0)
     - values: goodness of the disc around the cell, 0 to 1; NaN if less than 80 % of the disc is mapped
     - hazard_m: distance to the nearest cell that is too high or too low
     """
@@ -134,45 +136,66 @@ class TerrainMap:
 
     def goodness(self, limits: GroundLimits) -> Goodness:
         """Evaluate the ground under a disc at each cell."""
-        is_mapped = self.mapped_cells
-        # heights relative to their mean, to reduce rounding errors
-        reference = float(np.nanmean(self.median_m)) if is_mapped.any() else 0.0
-        z = np.where(is_mapped, self.median_m - reference, 0.0)
-        weight = is_mapped.astype(np.float64)
-        disc, x, y = _disc(limits.radius_m)
-
-        def sum_over_disc(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
-            return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT))
-
-        # normal equations of z = a + b x + c y over the mapped cells of the disc
-        count, sx, sy = sum_over_disc(weight, disc), sum_over_disc(weight, x), sum_over_disc(weight, y)
-        sxx, sxy, syy = sum_over_disc(weight, x * x), sum_over_disc(weight, x * y), sum_over_disc(weight, y * y)
-        sz, sxz, syz, szz = sum_over_disc(z, disc), sum_over_disc(z, x), sum_over_disc(z, y), sum_over_disc(z * z, disc)
-        is_known = count >= _MIN_MAPPED_FRACTION * disc.sum()
-        matrices = np.stack([count, sx, sy, sx, sxx, sxy, sy, sxy, syy], axis=-1).reshape(*z.shape, 3, 3)[is_known]
-        right_hand_sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
-        planes = np.linalg.solve(matrices, right_hand_sides[..., None])[..., 0]
-        squared_residuals = szz[is_known] - np.sum(planes * right_hand_sides, axis=-1)
-        centre = np.full(z.shape, np.nan)
-        centre[is_known] = planes[:, 0] + reference
-        hazard = is_known & is_mapped
+        planes, disc = _fit_planes(self.median_m, limits.radius_m), _disc(limits.radius_m)[0]
+        is_known = planes.is_known
+        centre = np.full(is_known.shape, np.nan)
+        centre[is_known] = planes.heights_m
+        hazard = is_known & self.mapped_cells
         with np.errstate(invalid="ignore"):
             step = np.maximum(self.upper_m - centre, centre - self.lower_m)
             hazard &= step > limits.climb_m
         distance = cv2.distanceTransform((~hazard).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
-        tilt = np.arctan(np.hypot(planes[:, 1], planes[:, 2]))
-        roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
         # largest step of any cell in the disc
-        steps = np.where(is_known & is_mapped, np.nan_to_num(step), 0.0)
+        steps = np.where(is_known & self.mapped_cells, np.nan_to_num(step), 0.0)
         max_steps = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
         margins = [
-            1.0 - tilt / limits.tilt_rad,
-            1.0 - roughness / limits.roughness_m,
+            1.0 - planes.tilts_rad / limits.tilt_rad,
+            1.0 - planes.roughness_m / limits.roughness_m,
             1.0 - max_steps[is_known] / limits.climb_m,
         ]
-        values = np.full(z.shape, np.nan)
+        values = np.full(is_known.shape, np.nan)
         values[is_known] = np.maximum(np.min(margins, axis=0), 0.0)
         return Goodness(self.corner_m, values, np.asarray(distance, dtype=np.float64))
+
+
+class _Planes(NamedTuple):
+    """Planes fitted to the discs around the cells of a map.
+
+    - is_known: cells whose disc is mapped well enough; the other fields have one value for each of them
+    - heights_m: height of the plane at the cell
+    - tilts_rad, roughness_m: tilt of the plane, and standard deviation of the heights from it
+    """
+
+    is_known: Mask
+    heights_m: Vector
+    tilts_rad: Vector
+    roughness_m: Vector
+
+
+def _fit_planes(heights_m: Raster, radius_m: float) -> _Planes:
+    """Fit a plane to the mapped cells of the disc around each cell by least squares."""
+    is_mapped = np.isfinite(heights_m)
+    # heights relative to their mean, to reduce rounding errors
+    reference = float(np.nanmean(heights_m)) if is_mapped.any() else 0.0
+    z = np.where(is_mapped, heights_m - reference, 0.0)
+    weight = is_mapped.astype(np.float64)
+    disc, x, y = _disc(radius_m)
+
+    def sum_over_disc(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
+        return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT))
+
+    # normal equations of z = a + b x + c y over the mapped cells of the disc; x and y contain its weights, 0 or 1
+    count, sx, sy = sum_over_disc(weight, disc), sum_over_disc(weight, x), sum_over_disc(weight, y)
+    sxx, sxy, syy = sum_over_disc(weight, x * x), sum_over_disc(weight, x * y), sum_over_disc(weight, y * y)
+    sz, sxz, syz, szz = sum_over_disc(z, disc), sum_over_disc(z, x), sum_over_disc(z, y), sum_over_disc(z * z, disc)
+    is_known = count >= _MIN_MAPPED_FRACTION * disc.sum()
+    matrices = np.stack([count, sx, sy, sx, sxx, sxy, sy, sxy, syy], axis=-1).reshape(*z.shape, 3, 3)[is_known]
+    right_hand_sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
+    planes = np.linalg.solve(matrices, right_hand_sides[..., None])[..., 0]
+    squared_residuals = szz[is_known] - np.sum(planes * right_hand_sides, axis=-1)
+    height, slope_x, slope_y = planes.T
+    roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
+    return _Planes(is_known, height + reference, np.arctan(np.hypot(slope_x, slope_y)), roughness)
 
 
 @lru_cache(maxsize=8)

@@ -97,15 +97,15 @@ def estimate_motion(first: StereoMeasurement, second: StereoMeasurement, predict
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
         if np.count_nonzero(inliers) < _MIN_INLIERS:
-            return MotionEstimate(
-                VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, int(np.count_nonzero(inliers)), float("nan")
-            )
+            break
         whitening = _compute_whitening(covariances, motion)
         motion, sigma_m = _refine_motion(points, second_points, whitening, inliers, motion)
         residuals = _residuals(points, second_points, whitening, rotation_matrix(motion), motion.translation)
         distances = np.linalg.norm(residuals, axis=1)
         inliers = distances <= _MAX_NORMALISED_DISTANCE
     inlier_count = int(np.count_nonzero(inliers))
+    if inlier_count < _MIN_INLIERS:
+        return MotionEstimate(VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, inlier_count, float("nan"))
     outcome = _check_motion(motion, sigma_m, predicted)
     is_valid = outcome is VisualOdometryOutcome.CONVERGED
     return MotionEstimate(outcome, motion if is_valid else None, count, inlier_count, sigma_m)

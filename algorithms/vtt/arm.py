@@ -29,6 +29,8 @@ CONTACT_M, TOOLS_M, CLEARANCE_M = 0.02, 0.05, 0.015
 MAX_RESELECTION_M = 0.008
 #: Spacing of the positions that are checked, metres.
 _SPACING_M = 0.002
+#: Tolerance of distances on this grid, so that rounding errors do not exclude its last positions, metres.
+_ROUNDING_M = 1e-9
 #: Minimum number of surface points on the contact disc.
 _MIN_POINTS = 20
 #: Depths of surface points, divided by the target's depth.
@@ -84,6 +86,7 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration) -
     axis = mast.geometry.base_m + np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
     range_m = float(np.linalg.norm(position - axis))
     error = tracked_approach_error_m(
+        # focal length times baseline is one argument, so the other one is 1
         stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
         drift_error_m(range_m, mast.left.focal_lengths[0], DRIFT_PX),
     )
@@ -152,7 +155,8 @@ def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3) -> floa
 def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
     """Fit a plane by least squares; return its centre and the unit normal towards the viewpoint."""
     centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    *_, principal_axes = np.linalg.svd(points - centre, full_matrices=False)
+    normal = principal_axes[-1]  # of least variance
     return centre, normal if normal @ (viewpoint - centre) > 0.0 else -normal
 
 
@@ -186,9 +190,9 @@ def _offsets(normal: Vector3, radius_m: float) -> Points3:
     """Create the offsets of a square grid within a radius, perpendicular to a normal, from near to far."""
     first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     first /= np.linalg.norm(first)
-    count = int(radius_m / _SPACING_M + 1e-9)
+    count = int((radius_m + _ROUNDING_M) / _SPACING_M)
     steps = _SPACING_M * np.arange(-count, count + 1)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     radii = np.hypot(*grid.T)
-    grid = grid[np.argsort(radii, kind="stable")][: int(np.count_nonzero(radii <= radius_m + 1e-9))]
+    grid = grid[np.argsort(radii, kind="stable")][: int(np.count_nonzero(radii <= radius_m + _ROUNDING_M))]
     return np.asarray(grid @ np.stack([first, np.cross(normal, first)]))

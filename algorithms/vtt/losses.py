@@ -42,6 +42,7 @@ def tolerances(distances: Distances, left: CameraModel, right: CameraModel, opti
 
     def compute_tolerance(reference_m: float, motion_m: float, lateral_m: float) -> float:
         error_px = options.stereo_disparity_error_px
+        # focal length times baseline is one argument, so the other one is 1
         errors_m = [
             stereo_range_error_m(range_m, focal_times_baseline, 1.0, error_px)
             for range_m in (reference_m, distances.current_m)

@@ -26,6 +26,8 @@ from marsyard.sim.measurements import MastImage
 FLOW_LEVELS = 3
 #: Normalisation to the 8-bit images of OpenCV: standard deviation and mean, grey levels.
 SIGMA_GREY, MEAN_GREY = 40.0, 128.0
+#: Registrations after the pure shift, in this order, for each option `warp` except ``none``.
+_WARPS_BY_OPTION: dict[str, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,6 @@ class Match:
     template: Patch
 
 
-#: Registrations after the pure shift, in this order, for each option `warp`.
-_WARPS_BY_OPTION: dict[str, tuple[Warp, ...]] = {
-    "none": (),
-    "shift": (),
-    "stretch": ("stretch",),
-    "bend": ("stretch", "bend"),
-}
 #: Function that matches the target in a new image near a full-frame pixel; None if the window does not fit.
 Matcher = Callable[[Sighting, MastImage, Vector2, ViewChange, VttOptions], Match | None]
 
@@ -189,7 +184,8 @@ def match_by_lucas_kanade(
 ) -> Match | None:
     """Match the target by its optical flow from the old image, magnified and rolled, to the new image; a `Matcher`.
 
-    The score is the normalised correlation at the match; 0 if the flow does not converge or leaves the image.
+    The score is the normalised correlation at the match. If the flow does not converge or leaves the image, the result
+    is the predicted pixel with the score 0, or None if that pixel is outside of the image.
     """
     window, corner = search_window(image, predicted_pixel, options.search_px)
     if min(window.shape) < options.template_px:
@@ -214,7 +210,7 @@ def match_by_lucas_kanade(
     )
     pixel = np.asarray(tracked_point, dtype=np.float64).reshape(2) + corner
     if not status[0, 0] or not window_fits(image, pixel, options.template_px):
-        return Match(predicted_pixel, 0.0, template)
+        return Match(predicted_pixel, 0.0, template) if window_fits(image, predicted_pixel, 1) else None
     return Match(pixel, correlation(template, extract_patch(image, pixel, options.template_px)), template)
 
 

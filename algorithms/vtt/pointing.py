@@ -20,6 +20,8 @@ from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
 #: Maximum number of Newton steps, and the pixel error below which only one more step is made (quadratic convergence).
 STEPS, TOLERANCE_PX = 12, 1e-2
+#: Minimum determinant of the pixel's derivatives with respect to both angles, (pixels per radian)^2.
+_MIN_DETERMINANT = 1e-9
 #: Tolerance of region borders, so that rounding errors do not move a border that lies on a whole pixel.
 _BORDER_TOLERANCE_PX = 1e-6
 
@@ -38,7 +40,8 @@ def mast_angles(position_rover: Vector3, mast: MastCalibration, use_both: bool =
     angles = np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
     for _ in range(STEPS):
         offset, jacobian = _compute_offset(position_rover, mast.geometry, cameras, angles)
-        if not np.all(np.isfinite(jacobian)) or abs(np.linalg.det(jacobian)) < 1e-9:
+        # a point on the azimuth axis does not move in the image if the mast turns
+        if not np.all(np.isfinite(jacobian)) or abs(np.linalg.det(jacobian)) < _MIN_DETERMINANT:
             return None
         angles = angles - np.linalg.solve(jacobian, offset)
         if np.hypot(*offset) < TOLERANCE_PX:

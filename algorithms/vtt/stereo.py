@@ -17,6 +17,11 @@ from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastImage
 
+#: Inverse of the largest searched range, 1/m; at 1000 km the disparity is below a hundredth of a pixel.
+_MIN_INVERSE_RANGE = 1e-6
+#: Squared sine of the angle between two lines of sight above which they are not parallel; above its rounding errors.
+_MIN_SQUARED_SINE = 1e-14
+
 
 @dataclass(frozen=True)
 class StereoMatch:
@@ -61,13 +66,16 @@ def search_ranges(left: CameraModel, right: CameraModel, range_m: float, dispari
     """Smallest and largest range whose disparity differs by at most `disparity_px` from that of `range_m`."""
     inverse_step = disparity_px / disparity_px_m(left, right)
     inverse = 1.0 / range_m
-    return 1.0 / (inverse + inverse_step), 1.0 / max(inverse - inverse_step, 1e-6)
+    return 1.0 / (inverse + inverse_step), 1.0 / max(inverse - inverse_step, _MIN_INVERSE_RANGE)
 
 
 def point_stereo(
     template: Patch, image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
-    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None without match."""
+    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image.
+
+    None if the image contains no position of the template within the tolerance of the curve.
+    """
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
     curve_px = curve - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
@@ -84,7 +92,10 @@ def point_stereo(
     # accept only positions within the tolerance above or below the curve
     columns_px, rows_px = (curve_px[np.argsort(curve_px[:, 0])] - start - half).T
     curve_rows = np.interp(np.arange(surface.shape[1]), columns_px, rows_px)
-    peak = highest_peak(np.where(np.abs(np.arange(surface.shape[0])[:, None] - curve_rows) > tolerance, -1.0, surface))
+    is_near_curve = np.abs(np.arange(surface.shape[0])[:, None] - curve_rows) <= tolerance
+    if not np.any(is_near_curve):
+        return None
+    peak = highest_peak(np.where(is_near_curve, surface, -1.0))
     corner = start[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
@@ -104,8 +115,8 @@ def nearest_point(left: LineOfSight, right: LineOfSight) -> Vector3 | None:
     """
     (left_origin, left_ray), (right_origin, right_ray) = left, right
     offset, cosine = right_origin - left_origin, float(left_ray @ right_ray)
-    determinant = 1.0 - cosine * cosine
-    if not determinant > 1e-14:
+    determinant = 1.0 - cosine * cosine  # squared sine of the angle between the lines
+    if not determinant > _MIN_SQUARED_SINE:
         return None
     left_range_m = float(offset @ (left_ray - cosine * right_ray)) / determinant
     right_range_m = float(offset @ (cosine * left_ray - right_ray)) / determinant

@@ -211,11 +211,13 @@ def seed_track(track: TargetTrack, measurements: RoverMeasurements, options: Vtt
         pixel = stop.left.project(expected)[0]
         ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not matching.window_fits(measurements.left, pixel, options.template_px):
-        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(seeded=True, predicted_pixel=None))
     template = matching.extract_patch(measurements.left, pixel, options.template_px)
     window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
     match = matching.Match(pixel, 1.0, template)
-    details = VttDetails(True, pixel, window, window_corner, match=match, template=template)
+    details = VttDetails(
+        seeded=True, predicted_pixel=pixel, window=window, window_corner=window_corner, match=match, template=template
+    )
     result = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = result.details.stereo
     if result.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
@@ -236,12 +238,14 @@ def follow_track(
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
     points = prediction.roll_points(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
     if points is None:
-        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(seeded=False, predicted_pixel=None))
     predicted = points[0]
     magnification = prediction.magnification(last.position_head, last.camera.c, expected, stop.left.c)
     change = prediction.ViewChange(magnification, prediction.roll_angle(points))
     window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
-    details = VttDetails(False, predicted, window, window_corner, change)
+    details = VttDetails(
+        seeded=False, predicted_pixel=predicted, window=window, window_corner=window_corner, change=change
+    )
     applied_magnification = change.magnification if options.scale else 1.0
     applied_change = prediction.ViewChange(applied_magnification, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied_change, options)

@@ -13,8 +13,9 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.images import take_images
+from marsyard.scenarios.landing.map_score import map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.score import map_row, motion_row
+from marsyard.scenarios.landing.score import motion_row
 from marsyard.scenarios.landing.simulation import measure
 from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset

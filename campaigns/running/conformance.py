@@ -16,7 +16,7 @@ from marsyard.scenarios.conformance.checks import Finding
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
-def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.CandidateAlgorithm:
+def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Subject:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
     limit_s: time limit of one answer
@@ -30,15 +30,15 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Ca
         candidates.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return candidates.CandidateAlgorithm(spec, task_name, limit_s)
+    return candidates.Subject(spec, task_name, limit_s)
 
 
-def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[Finding]:
+def run_conformance_checks(subject: candidates.Subject) -> Iterator[Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
     # the time limit of an answer, the same time for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
-        for number, (name, requirement) in enumerate(candidates.check_names(subject)):
+        for number, (name, requirement) in enumerate(candidates.list_checks(subject)):
             ((result,),) = workers.run(
                 Work(partial(candidates.run_check, subject), [number], limits, load=partial(_load_subject, subject))
             )
@@ -61,7 +61,7 @@ def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[F
                 return
 
 
-def _load_subject(subject: candidates.CandidateAlgorithm) -> None:
+def _load_subject(subject: candidates.Subject) -> None:
     """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()

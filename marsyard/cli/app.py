@@ -16,6 +16,8 @@ from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.errors import Exit, handle_user_errors
 
+#: Environment variable of the option `--render-device`.
+DEVICE_VARIABLE = "MARSYARD_RENDER_DEVICE"
 #: Commands by help panel: their names, and their functions as ``module:function`` of this package.
 PANELS = {
     "Run campaigns": {
@@ -47,7 +49,7 @@ PANELS = {
     },
     "Custom campaigns and algorithms": {
         "new": "new:new",
-        "ingest": "new:ingest",
+        "ingest": "ingest:ingest",
         "conformance": "conformance:conformance",
         "export": "export:export",
         "score": "export:score",
@@ -130,10 +132,6 @@ def _print_version(is_requested: bool) -> None:
 
         typer.echo(f"marsyard {version('marsyard')}")
         raise typer.Exit
-
-
-#: Environment variable of the option `--render-device`.
-DEVICE_VARIABLE = "MARSYARD_RENDER_DEVICE"
 
 
 @app.callback()

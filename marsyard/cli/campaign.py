@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -187,6 +188,8 @@ def resume(
     if trust:
         adopt(directory)
     if contains_study(directory):
+        given = {"--retry": bool(retry), "--case-time": case_time is not None, "--allow-changed": allow_changed}
+        _reject_study_options(directory, given)
         continue_study_and_exit(directory, jobs, cluster)
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for name in retry or []:
@@ -201,6 +204,14 @@ def resume(
         _continue_until_decided(directory, executor, observer)
 
     run_and_evaluate(directory, continue_campaign)
+
+
+def _reject_study_options(directory: Path, given: Mapping[str, bool]) -> None:
+    """Raise CampaignError if an option of campaigns is given for a study; `given`: whether each option is."""
+    from marsyard.campaigns.errors import CampaignError
+
+    if options_given := [option for option, is_given in given.items() if is_given]:
+        raise CampaignError(f"{', '.join(options_given)}: not for studies; {directory} contains a study")
 
 
 @handle_user_errors
@@ -229,6 +240,7 @@ def append(
     if trust:
         adopt(directory)
     if contains_study(directory):
+        _reject_study_options(directory, {"--allow-changed": allow_changed})
         continue_study_and_exit(directory, jobs, cluster, cases, is_random=random)
     if random:
         raise CampaignError(f"--random is for studies of `marsyard rare`; {directory} contains a campaign")

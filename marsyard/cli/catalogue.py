@@ -61,14 +61,14 @@ def show(
 
     if figure is not None and draw is None:
         raise CampaignError("--figure plots draws: give the number of cases with --draw N")
-    definition = load_campaign(campaign, override or [])
+    selected = load_campaign(campaign, override or [])
     if figure is not None and draw is not None:
-        write_draws_figure(definition, draw, figure)
+        write_draws_figure(selected, draw, figure)
     if as_json:
-        typer.echo(json.dumps(describe_campaign(definition, draw), indent=2))
+        typer.echo(json.dumps(describe_campaign(selected, draw), indent=2))
     elif draw is None:
-        show_campaign(definition, create_console())
+        show_campaign(selected, create_console())
     else:
-        show_draws(definition, draw, create_console())
+        show_draws(selected, draw, create_console())
     if figure is not None:
         typer.echo(f"figure: {figure}", err=as_json)

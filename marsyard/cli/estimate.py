@@ -1,11 +1,9 @@
-"""Time, disk space and limits of the evidence of a campaign, printed before it runs."""
-
-import os
+"""Estimates printed before a campaign runs: time, disk space, and requirements that cannot be PASS."""
 
 import typer
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig, available_cores
 from marsyard.campaigns.running.estimate import estimate_campaign
 from marsyard.cli.terminal import size_text
 from marsyard.reports.sampling_design import read_sampling_design
@@ -53,14 +51,11 @@ def evidence_limits(campaign: Campaign) -> list[str]:
 
 def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     """Print the estimated time and disk space of a campaign."""
-    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
+    workers = executor.jobs if executor.cluster is None else _cluster_workers(executor.cluster)
     estimate = estimate_campaign(campaign, workers)
     total = campaign.definition.total_cases
     low, high = estimate.case_range_s
-    time_s = estimate.time_s
-    duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
-    duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
-    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration_text(estimate.time_s)}")
     if estimate.inputs:
         typer.echo(f"  {count(estimate.inputs, 'terrain')} (shared inputs) to build, {estimate.input_s:.3g} s each")
     trials = count(estimate.trials, "trial case")
@@ -72,6 +67,22 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     if estimate.inputs_bytes:
         limit = size_text(estimate.cache_limit_bytes)
         typer.echo(f"  {size_text(estimate.inputs_bytes)} of terrains in the cache (maximum {limit})")
+
+
+def _cluster_workers(address: str) -> int:
+    """Return the number of workers of a new cluster ``local:N``; that of another cluster is assumed."""
+    kind, _, number = address.partition(":")
+    if kind == "local" and number.isdecimal() and int(number):
+        return int(number)
+    typer.echo("note: the cluster is assumed to have one worker per core of this machine")
+    return available_cores()
+
+
+def _duration_text(time_s: float) -> str:
+    """Format a duration in the largest unit of which there are at least two."""
+    if time_s < 120.0:
+        return f"{time_s:.0f} s"
+    return f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
 
 
 def print_limits(campaign: Campaign) -> None:

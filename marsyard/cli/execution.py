@@ -57,7 +57,7 @@ def show_progress(directory: Path, next_command: str = "") -> Iterator[ProgressO
             stored = read(directory)
             rows = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
             typer.echo(f"interrupted; {rows}. To continue: {next_command or f'marsyard resume {directory}'}", err=True)
-        except CampaignError:
+        except CampaignError:  # interrupted before the record was written: there are no rows
             pass
         raise typer.Exit(Exit.INTERRUPTED) from None
 

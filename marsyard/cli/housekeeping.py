@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -17,6 +18,8 @@ KINDS = {
     "terrain": "terrains of campaigns; rebuilt when a case needs one, seconds to minutes each",
     "kernels": "compiled code; recompiled at the next run, about a minute",
 }
+#: Number of processes that compile the kernels of scenarios.
+_COMPILING_PROCESSES = 2
 #: Kind of cached files with a size limit (MARSYARD_CACHE_GB).
 KIND_WITH_LIMIT = "terrain"
 
@@ -41,12 +44,12 @@ def compile_kernels() -> None:
 
     missing = []
     for item in list_compilations():
-        if kernels_are_ready(item[0]):
-            typer.echo(f"{item[0]}: already compiled")
+        if kernels_are_ready(item.scenario):
+            typer.echo(f"{item.scenario}: already compiled")
         else:
             missing.append(item)
     # all scenarios call the kernels of the renderer: the first one compiles them, then the others run in parallel
-    for group, jobs in ((missing[:1], 1), (missing[1:], 2)):
+    for group, jobs in ((missing[:1], 1), (missing[1:], _COMPILING_PROCESSES)):
         if group:
             lines = Parallel(n_jobs=jobs, return_as="generator")(delayed(_compile_scenario)(*item) for item in group)
             for line in lines:
@@ -80,24 +83,12 @@ def clean(
     from rich.table import Table
 
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
-    from marsyard.sim.cache import UNFINISHED
 
     for kind in kinds or []:
         if kind not in KINDS:
             raise CampaignError(unknown_name_message("kind", kind, KINDS))
     caches = [cache_usage(kind) for kind in kinds or KINDS]
-    removed_bytes = 0
-    paths = [path for cache in caches for path in sorted(cache["folder"].rglob("*"), reverse=True)] if yes else []
-    for path in paths:
-        try:
-            if path.is_dir() and not path.is_symlink():
-                path.rmdir()
-            elif path.suffix != UNFINISHED:  # files with this suffix are being written by another process
-                size = path.stat().st_size
-                path.unlink()
-                removed_bytes += size
-        except OSError:  # not empty, in use, or already removed
-            continue
+    removed_bytes = sum(_remove_contents(cache["folder"]) for cache in caches) if yes else 0
     if as_json:
         typer.echo(json.dumps({"caches": caches, "removed_bytes": removed_bytes}, indent=2, default=str))
         return
@@ -114,6 +105,24 @@ def clean(
         typer.echo(f"removed {size_text(removed_bytes)}")
     else:
         typer.echo("nothing was removed; to remove these files: marsyard clean --yes")
+
+
+def _remove_contents(folder: Path) -> int:
+    """Remove the files and folders in a folder, except those in use; return the size of the removed files, bytes."""
+    from marsyard.sim.cache import UNFINISHED
+
+    removed_bytes = 0
+    for path in sorted(folder.rglob("*"), reverse=True):  # the contents of a folder before the folder
+        try:
+            if path.is_dir() and not path.is_symlink():
+                path.rmdir()
+            elif path.suffix != UNFINISHED:  # files with this suffix are being written by another process
+                size = path.stat().st_size
+                path.unlink()
+                removed_bytes += size
+        except OSError:  # not empty, in use, or already removed
+            continue
+    return removed_bytes
 
 
 def cache_usage(kind: str) -> dict[str, Any]:

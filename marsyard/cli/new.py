@@ -1,10 +1,8 @@
-"""Commands `marsyard new` and `ingest`: create a campaign from options or questions, or from recorded images."""
+"""Command `marsyard new`: write a campaign file from options, or from the answers to questions."""
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -19,10 +17,7 @@ from marsyard.cli.options import OverwriteOption
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
-#: Name of the campaign file that `marsyard ingest` writes.
-CAMPAIGN_FILE = "campaign.toml"
 
 
 @handle_user_errors
@@ -79,15 +74,16 @@ def new(
     ask_camera, ask_flight = (
         is_interactive and option not in template.unsupported_options for option in ("camera", "flight")
     )
-    names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
-    site = site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
+    site_names = [key for key, preset in sites().items() if getattr(preset, template.scale) is not None]
+    site = site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, site_names))
     question = "Camera file (empty: the paper's camera)"
     camera = camera or _ask_user(question, "", ask_camera, _find_camera_problem)
     flight = flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
-    bound = math.nan if bound is None else bound
-    if math.isnan(bound):
+    if bound is None:
         bound = float(_ask_user(question, default, is_interactive, partial(_find_number_problem, template.max_bound)))
+    elif not math.isfinite(bound):
+        raise CampaignError(f"--bound {bound:g}: allowed: a finite number")
     choices = Choices(name, site, camera, detector or "", flight, axes, bound, cases)
     campaign = _write_and_load(path, template, choices)
     summary = f"{path}: {system} over {site}, {count(cases, 'case')}"
@@ -165,55 +161,3 @@ def _find_number_problem(limit: float, answer: str) -> str:
         number = 0.0
     upper_limit = "" if limit == math.inf else f" and below {limit:g}"
     return "" if 0.0 < number < limit else f"'{answer}' is not allowed; allowed: a number above 0{upper_limit}"
-
-
-@handle_user_errors
-def ingest(
-    folder: Annotated[
-        Path,
-        Argument(metavar="FOLDER", help="Folder with ingest.toml, images.csv and the images (docs/real-images.md)."),
-    ],
-    out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
-    system: Annotated[
-        str | None,
-        Option(
-            help="System of an installed package whose importer reads the folder; by default the built-in importer, "
-            "for the task that ingest.toml states: velocity, landing, matching or map."
-        ),
-    ] = None,
-) -> None:
-    """Create a campaign from recorded images with measured poses, or over a map."""
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
-    from marsyard.reports.wording import count
-    from marsyard.scenarios.imports import import_object
-    from marsyard.scenarios.systems import systems
-
-    importers = {candidate.name: candidate.ingest for candidate in systems() if candidate.ingest}
-    name = system or next(iter(importers))
-    if name not in importers:
-        raise CampaignError(f"--system: {unknown_name_message('system', name, importers)}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"{out} exists and is not empty; give a new folder with --out")
-    partial_folder = out.with_name(f"{out.name}.part{os.getpid()}")
-    try:
-        with report_write_errors(f"{out}:"):
-            partial_folder.mkdir(parents=True)
-            ingested: Ingested = import_object(importers[name])(folder, partial_folder, out.resolve())
-            (partial_folder / CAMPAIGN_FILE).write_text(ingested.campaign, encoding="utf-8")
-            if out.exists():
-                out.rmdir()
-            partial_folder.rename(out)
-    except ValueError as error:
-        raise CampaignError(str(error)) from error
-    finally:
-        shutil.rmtree(partial_folder, ignore_errors=True)
-    try:
-        load_campaign(str(out / CAMPAIGN_FILE))
-    except CampaignError:  # remove a campaign that cannot be run
-        shutil.rmtree(out)
-        raise
-    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.images, 'image')}: {out}")
-    if ingested.note:
-        typer.echo(ingested.note)
-    typer.echo(f"to run the cases: marsyard run {out / CAMPAIGN_FILE}")

@@ -61,16 +61,22 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         lines.append(f"rows: not verified, since {run.unverified}")
     lines.append(f"report: {page}")
     if not is_finished:
-        state = "killed" if stored["state"] == "running" else stored["state"]
-        reason = f"the campaign was {state}; to continue: marsyard resume {directory}"
-        if stored["state"] == SHARD_STATE:
-            reason = f"shard {stored[SHARD_KEY]}; to combine all shards: marsyard merge DIR... --out DIR"
-        reason = "the campaign is running" if is_locked(directory) else reason
-        lines.insert(0, f"INCOMPLETE: {len(run.all_cases)} of {count(stored['cases'], 'case')}; {reason}")
+        cases = f"{len(run.all_cases)} of {count(stored['cases'], 'case')}"
+        lines.insert(0, f"INCOMPLETE: {cases}; {_describe_unfinished(directory, stored)}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # an unfinished campaign cannot meet its requirements: replace status 0
     return evaluation.exit_code if is_finished else evaluation.exit_code or Exit.INSUFFICIENT
+
+
+def _describe_unfinished(directory: Path, stored: Mapping[str, Any]) -> str:
+    """Return the state of an unfinished campaign from its record, and the command that continues it."""
+    if is_locked(directory):
+        return "the campaign is running"
+    if stored["state"] == SHARD_STATE:
+        return f"shard {stored[SHARD_KEY]}; to combine all shards: marsyard merge DIR... --out DIR"
+    state = "killed" if stored["state"] == "running" else stored["state"]
+    return f"the campaign was {state}; to continue: marsyard resume {directory}"
 
 
 def evaluate_and_store(directory: Path, requirements: Requirements | None = None) -> tuple[Evaluation, Path]:

@@ -73,7 +73,8 @@ def replay(
         stage_lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
         output_lines = [f"products: {target}", *stage_lines, *(f"figure: {figure}" for figure in figures)]
     typer.echo(f"case {case}: {result.row['outcome']}")
-    for line in (result.row["error"] and (result.row["traceback"] or result.row["error"]), result.note):
+    error_text = result.row["error"] and (result.row["traceback"] or result.row["error"])
+    for line in (error_text, result.note):
         if line:
             typer.echo(line)
     typer.echo("\n".join(output_lines))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -20,9 +20,6 @@ from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
 from marsyard.reports.wording import count, requirement_text
 from marsyard.scenarios.columns import split_unit
-
-if TYPE_CHECKING:
-    pass
 
 #: Width of a column of drawn values including its margin, characters.
 _VALUE_WIDTH = 12
@@ -75,13 +72,15 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
     """
     values_by_path, nominal_cases = list_drawn_values(campaign, cases), int(campaign.definition.design.nominal)
     _print_header(campaign.definition, console)
-    cases = cases if values_by_path else 0
     units = {path: campaign.marginals[path].unit for path in values_by_path}
     names = {path: f"{path} ({unit})" if unit else path for path, unit in units.items()}
     name_width = max((len(name) for name in names.values()), default=0)
     visible_cases = min(cases, max(1, (console.width - name_width) // _VALUE_WIDTH - len(_STATISTICS)))
     hint = "" if visible_cases == cases else "; --json prints all cases"
-    table = _create_table(f"Draws of {count(cases - nominal_cases, 'case')}{hint}", "parameter")
+    drawn_cases = cases - nominal_cases
+    if not values_by_path:  # no parameter is drawn
+        visible_cases, drawn_cases, hint = 0, 0, ""
+    table = _create_table(f"Draws of {count(drawn_cases, 'case')}{hint}", "parameter")
     table.box = box.SIMPLE_HEAD
     headings = ["nominal" if nominal_cases and case == 0 else f"case {case}" for case in range(visible_cases)]
     for heading in (*_STATISTICS, *headings):

@@ -302,7 +302,7 @@ def continue_study_and_exit(
             result = continue_study(directory, session)
     if name == SEARCH.name:
         _finish_search(directory, result)
-    if name == ROBUST.name:
+    if name == ROBUST.name:  # it is in a subfolder of the campaign's folder `ROBUST_FOLDER`
         _finish_robust(directory.resolve().parent.parent)
     _finish_study(directory, result.exit_code)
 

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.statistics import TerrainStatistics
 
-#: Nadir image: maximum side length, pixels; colours (blue, green, red) of filled holes and of the outline of a DTM.
-MAX_SIDE_PX = 2048
-HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
+#: Nadir image: maximum side length, pixels; percentile of the brightness that becomes white; colours (blue, green, red)
+#: of filled holes and of the outline of a DTM; opacity of the colour of holes.
+MAX_SIDE_PX, WHITE_PERCENTILE = 2048, 99.8
+HOLE_COLOUR, OUTLINE_COLOUR, HOLE_OPACITY = (40, 40, 220), (0, 200, 255), 0.6
 
 app = typer.Typer(no_args_is_help=True, help="List sites and print statistics of their terrain.")
 
@@ -127,13 +128,13 @@ def _write_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -> None:
     level = max(int(np.ceil(np.log2(side / MAX_SIDE_PX))), 0)
     # light from the north-west, as usual for shaded relief
     shaded = render_nadir_image(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
-    # scale the brightness; the brightest 0.2 % of the pixels are saturated
-    grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
+    grey = np.clip(255.0 * shaded / np.percentile(shaded, WHITE_PERCENTILE), 0.0, 255.0).astype(np.uint8)
     image = np.repeat(grey[..., None], 3, axis=2)
     if dtm is not None:
         step = 2**level
         holes = dtm.filled_samples(side)[::step, ::step]
-        image[holes] = (0.4 * image[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
+        coloured = (1.0 - HOLE_OPACITY) * image[holes] + HOLE_OPACITY * np.array(HOLE_COLOUR)
+        image[holes] = coloured.astype(np.uint8)
         south_west = dtm.columns.start // step, dtm.rows.start // step
         north_east = dtm.columns.stop // step, dtm.rows.stop // step
         cv2.rectangle(image, south_west, north_east, OUTLINE_COLOUR, 1)

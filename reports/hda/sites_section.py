@@ -32,7 +32,7 @@ from marsyard.reports.section import (
 )
 from marsyard.reports.statistics.samples import is_interpolated, quantile_bounds
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number
-from marsyard.scenarios.landing.score import CLASS_BOUNDS, CLASS_NAMES
+from marsyard.scenarios.landing.map_score import CLASS_BOUNDS, CLASS_NAMES
 
 #: Minimum number of values for a cumulative curve.
 MIN_CURVE_VALUES = 5

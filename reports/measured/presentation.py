@@ -60,7 +60,7 @@ class MatchedPair:
 
 
 def read_matched_pairs(products: Products) -> list[MatchedPair]:
-    """Read the valid pairs of a case's products (`marsyard.scenarios.measured.matching.agreement_products`)."""
+    """Read the valid pairs of a case's products (`marsyard.scenarios.measured.pose_agreement.agreement_products`)."""
     pairs = []
     for image_number in _IMAGE_NUMBERS:
         # columns of the table: (u, v) in both images, offset (u, v), and 1 for inliers

@@ -1,4 +1,4 @@
-"""Algorithms and parts under test: the suite of each, and its checks, which run one by one."""
+"""Subjects of conformance checks, algorithms and user-defined parts: the task and the suite of each, and its checks."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -39,11 +39,11 @@ def subject_kinds() -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class CandidateAlgorithm:
-    """An algorithm or a user-defined part under test.
+class Subject:
+    """The algorithm or the user-defined part under test.
 
     - spec: name of the algorithm (`marsyard.scenarios.tasks`) or part (`marsyard.scenarios.parts`)
-    - task: name of the algorithm's task, or of the kind of part
+    - task: name of the algorithm's task, or of the part's kind
     - limit_s: maximum computation time of an answer
     """
 
@@ -55,7 +55,8 @@ class CandidateAlgorithm:
         """Return the conformance suite of the algorithm or part."""
         if self.task in KINDS:
             kind = KINDS[self.task]
-            return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
+            create = partial(parts.load_part, kind, self.spec)
+            return parts.PartSuite(create, self.spec, is_program=False, limit_s=self.limit_s, kind=kind)
         task = tasks()[self.task]
         limits = ExecutableLimits(time_s=self.limit_s, isolated=False)
         is_program = self.spec.startswith(tuple(PREFIXES))
@@ -74,11 +75,12 @@ class CandidateAlgorithm:
             return trackers.TrackerSuite(create, self.spec, is_program, self.limit_s)
         arguments = create, self.spec, is_program, self.limit_s
         if task.accepts_stream(self.spec):
-            return estimators.StreamSuite(*arguments, estimators.STREAM)
-        return estimators.EstimatorSuite(*arguments, estimators.VELOCITY if task is VELOCITY else estimators.LANDING)
+            return estimators.StreamSuite(*arguments, estimators.STREAM_RULES)
+        rules = estimators.VELOCITY_RULES if task is VELOCITY else estimators.LANDING_RULES
+        return estimators.EstimatorSuite(*arguments, rules)
 
     def prepare(self) -> None:
-        """Check that the algorithm or part exists, import it, and create the inputs of its suite."""
+        """Check that the algorithm or part exists, import it, and create and cache the inputs of its suite."""
         check_subject(self.spec, self.task)
         suite = self.suite()
         suite.cases()
@@ -94,13 +96,13 @@ def check_subject(spec: str, task: str) -> None:
         tasks()[task].check(spec)
 
 
-def check_names(subject: CandidateAlgorithm) -> list[tuple[str, str]]:
-    """Return names and requirements of a subject's checks."""
+def list_checks(subject: Subject) -> list[tuple[str, str]]:
+    """Return the name and the requirement of each check of a subject."""
     return [(check.name, check.requirement) for check in subject.suite().checks()]
 
 
-def run_check(subject: CandidateAlgorithm, number: int) -> Finding:
-    """Run the check with this index."""
+def run_check(subject: Subject, number: int) -> Finding:
+    """Run the check of a subject with this index in `list_checks`."""
     return list(subject.suite().checks())[number].evaluate()
 
 
@@ -122,7 +124,7 @@ def determine_task(spec: str) -> str:
         VELOCITY.check(spec)
     try:
         algorithm = import_object(path)
-    except (ImportError, AttributeError) as error:
+    except ImportError as error:
         raise ValueError(f"cannot import algorithm '{spec}': {error}") from error
     if hasattr(algorithm, "designate"):
         return TRACKING.name

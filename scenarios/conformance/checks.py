@@ -23,6 +23,8 @@ from marsyard.scenarios.isolation.host import reset
 
 #: Modules of `marsyard` that an algorithm may import, with their submodules (docs/architecture.md).
 ALLOWED_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
+#: Maximum number of forbidden imports in a message.
+_MAX_VIOLATIONS = 5
 _SCENARIOS = Path(__file__).resolve().parents[1]
 
 
@@ -217,7 +219,7 @@ class Suite(ABC):
                 if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed_prefixes):
                     violations.append(f"{name}, line {line}: {module}")
         if violations:
-            raise BreachError(f"it imports modules with access to the truth: {'; '.join(violations[:5])}")
+            raise BreachError(f"it imports modules with access to the truth: {'; '.join(violations[:_MAX_VIOLATIONS])}")
         return ""
 
 

@@ -163,14 +163,14 @@ def describe_velocity(estimate: VelocityEstimate) -> str:
     return f"{estimate.outcome.name}, {error:.2f} m/s error"
 
 
-def _first(number: int) -> DescentMeasurements:
+def _first_images(number: int) -> DescentMeasurements:
     """Return the descent of an ordinary stream with its first images only."""
     return inputs.inertial_descent(_STREAM_LENGTH).select(tuple(range(number)))
 
 
 _NO_TEXTURE = "they contain no texture"
-_stream = partial(inputs.inertial_descent, _STREAM_LENGTH)
-VELOCITY = SuiteRules(
+_create_stream = partial(inputs.inertial_descent, _STREAM_LENGTH)
+VELOCITY_RULES = SuiteRules(
     measurements=inputs.descent,
     check=lambda answer, measurements: check_velocity_answer(answer, measurements.tags_s),
     is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
@@ -178,23 +178,25 @@ VELOCITY = SuiteRules(
     failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
     unusual=unusual_images(inputs.descent, inputs.BLANKS, _NO_TEXTURE),
 )
-STREAM = replace(
-    VELOCITY,
-    measurements=_stream,
+STREAM_RULES = replace(
+    VELOCITY_RULES,
+    measurements=_create_stream,
     unusual={
-        **unusual_images(_stream, inputs.BLANKS, _NO_TEXTURE),
+        **unusual_images(_create_stream, inputs.BLANKS, _NO_TEXTURE),
         "few": Unusual(
-            "zero images and to one image", (partial(_first, 0), partial(_first, 1)), "no motion is visible"
+            "zero images and to one image",
+            (partial(_first_images, 0), partial(_first_images, 1)),
+            "no motion is visible",
         ),
         "number": Unusual(
             f"2, 3 and {_LONG_LENGTH} images",
-            (partial(_first, 2), partial(_first, 3), partial(inputs.inertial_descent, _LONG_LENGTH)),
+            (partial(_first_images, 2), partial(_first_images, 3), partial(inputs.inertial_descent, _LONG_LENGTH)),
         ),
         "no-increments": Unusual("a descent without increments", (partial(inputs.descent, _STREAM_LENGTH),)),
     },
-    interrupted=lambda: inputs.make_noisy(_stream()),
+    interrupted=lambda: inputs.make_noisy(_create_stream()),
 )
-LANDING = SuiteRules(
+LANDING_RULES = SuiteRules(
     measurements=inputs.landing,
     check=lambda answer, _: check_site(answer),
     is_valid=lambda estimate: estimate.outcome.converged,

@@ -41,7 +41,7 @@ DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
 #: Maximum time between images, and from the first to the last image, s.
 _INTERVAL_S, _DURATION_S = 3.75, 7.5
 #: Rate of the inertial unit, Hz, and gravity of Mars, m/s^2.
-_IMU_HZ, _GRAVITY_M_S2 = 100.0, 3.71
+_IMU_HZ, GRAVITY_M_S2 = 100.0, 3.72
 #: Attitudes of the images about z, y and x, degrees; further images repeat them.
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
 _START_POSITION_M = np.array([0.0, 0.0, 1900.0])
@@ -134,9 +134,9 @@ def inertial_descent(image_count: int) -> DescentMeasurements:
         times_s=times,
         period_s=1.0 / _IMU_HZ,
         delta_angles_rad=(attitudes[:-1].inv() * attitudes[1:]).as_rotvec(),
-        delta_velocities_m_s=attitudes[:-1].inv().apply([0.0, 0.0, _GRAVITY_M_S2 / _IMU_HZ]),
+        delta_velocities_m_s=attitudes[:-1].inv().apply([0.0, 0.0, GRAVITY_M_S2 / _IMU_HZ]),
     )
-    return replace(measurements, increments=increments, gravity_m_s2=_GRAVITY_M_S2)
+    return replace(measurements, increments=increments, gravity_m_s2=GRAVITY_M_S2)
 
 
 @cache

@@ -32,8 +32,8 @@ from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, P
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
 
-#: Gravity of Mars, m/s^2.
-_GRAVITY_M_S2 = 3.72
+#: Gravity of the Moon, m/s^2.
+_MOON_GRAVITY_M_S2 = 1.62
 #: Slope of the suite's ground (rise towards the east divided by distance), and its unit normal.
 _SLOPE = 0.05
 _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
@@ -56,10 +56,7 @@ def determine_kind(spec: str) -> str | None:
         return next((kind.name for kind in (DYNAMICS, INSTRUMENT) if hasattr(part, kind.members[0])), None)
     if not callable(part):
         return None
-    accepted_types = scores.accepted_cases(part)
-    # the types of a function without annotation are all types
-    is_annotated = accepted_types != scores.SCORED
-    return SCORE.name if accepted_types and is_annotated else None
+    return SCORE.name if scores.annotated_cases(part) else None
 
 
 @dataclass(frozen=True)
@@ -169,8 +166,8 @@ def motion_cases() -> tuple[MotionInputs, ...]:
     """Create the inputs of motions: three images on Mars, and five images at shorter intervals on the Moon."""
     return (
         # ground, gravity, times of the images, start and end of the poses (s), firing height (m)
-        MotionInputs(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
-        MotionInputs(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
+        MotionInputs(_ground_height, inputs.GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
+        MotionInputs(_ground_height, _MOON_GRAVITY_M_S2, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
     )
 
 
@@ -180,7 +177,7 @@ def swinging_fall() -> RecordedMotion:
     times = np.arange(-6.0, 22.0, 0.05)
     positions = np.column_stack([12.0 * times, -7.0 * times, 1900.0 - 75.0 * times])
     tilts = np.radians(10.0) * np.column_stack([np.sin(times), np.cos(times), 0.1 * times])
-    return RecordedMotion(times, positions, Rotation.from_rotvec(tilts), _GRAVITY_M_S2)
+    return RecordedMotion(times, positions, Rotation.from_rotvec(tilts), inputs.GRAVITY_M_S2)
 
 
 @cache

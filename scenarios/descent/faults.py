@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import Haze, SizedFaults
@@ -19,6 +19,11 @@ from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
+#: Faults of instruments, which have no effect on measurements without errors.
+INSTRUMENT_FAULTS = (
+    "exposure_delay_s", "shield_range_m", "altitude_error", "altitude_error_once", "attitude_error_deg",
+    "attitude_error_once_deg",
+)  # fmt: skip
 #: Index of the image that single-image faults affect; it belongs to both pairs.
 FAULTY_IMAGE = 1
 
@@ -56,6 +61,13 @@ class DescentFaults(SizedFaults):
     attitude_error_once_deg: Annotated[
         NonNegative, Field(le=90.0, description="additional tilt error of the attitude of image 2")
     ] = 0.0
+
+    @field_validator("repeated_image")
+    @classmethod
+    def _check_repeated_image(cls, number: int) -> int:
+        if number == 1:
+            raise ValueError("repeated_image is 1, which no image precedes; allowed: 2 or 3, or 0 for none")
+        return number
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the detector parameters that the faults change, including interference bursts on the camera cable."""

@@ -96,8 +96,8 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
 def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
     """Return the first time at the firing height, relative to the ground below the first image, or the last time."""
     times = np.linspace(max(p.image_times_s), motion.span_s[1] - IMU_MARGIN_S, _SEARCH_TIMES)
-    first = motion.state(0.0).position_m
-    heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
+    east_m, north_m, _ = motion.state(0.0).position_m
+    heights = motion.motion(times).positions_m[:, 2] - float(surface.height(east_m, north_m))
     indices = np.flatnonzero(heights <= p.descent.thruster_firing_m)
     if not indices.size or indices[0] == 0:
         return float(times[0 if indices.size else -1])

@@ -35,10 +35,12 @@ def take_exposures(
 
     Faults of the transmission (repeated or black images) are added later.
     """
-    first, last = states[0].position_m, states[-1].position_m
-    first_ground_m, last_ground_m = (float(world.surface.height(east, north)) for east, north, _ in (first, last))
-    scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - last_ground_m, optics.rays.pixel_rad)
-    clouds = draw_clouds(p.faults, first_ground_m, streams.generator("clouds"))
+    surface = world.surface
+    east_m, north_m, _ = states[0].position_m.tolist()
+    last_east_m, last_north_m, last_up_m = states[-1].position_m.tolist()
+    last_height_m = last_up_m - float(surface.height(last_east_m, last_north_m))
+    scene = world.scene(east_m, north_m, last_height_m, optics.rays.pixel_rad)
+    clouds = draw_clouds(p.faults, float(surface.height(east_m, north_m)), streams.generator("clouds"))
     # a disc at the camera casts the vehicle's shadow
     scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
     mounting, shield = draw_mounting(p, streams), None
@@ -48,7 +50,7 @@ def take_exposures(
     noise = streams.generator("detector noise")
     for state in states:
         frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
-        height = float(state.position_m[2]) - float(world.surface.height(*state.position_m[:2]))
+        height = float(state.position_m[2]) - float(surface.height(*state.position_m[:2]))
         extinction = world.air.mean_extinction_m(height) if world.ground else 0.0
         radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_PATH_M)
         if shield is not None:

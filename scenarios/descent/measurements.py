@@ -70,21 +70,30 @@ class DescentInstruments:
         uncalibrated_imu = Imu.draw(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrate(uncalibrated_imu, streams.generator("inertial unit's calibration"))
         clock = Clock.draw(p.clock, streams.generator("image clock"))
-        surface, motion = world.surface, flight.motion
-        # readings and result columns of the custom instruments, by name of the parameter table
-        custom: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
-        tags = clock.tags(np.array(p.image_times_s), streams.generator("image time tags"))
-        for table, times in (("altimeter", np.array(p.image_times_s)), ("attitude_source", tags)):
-            instrument = getattr(p, table)
-            if isinstance(instrument, CustomAltimeter | CustomAttitudeSource):
-                truth = InstrumentTruth(
-                    times_s=times,
-                    motion=motion,
-                    ground_height=lambda x, y: float(surface.height(x, y)),
-                    nearest_ground=partial(first_return, surface),
-                )
-                readings = instrument.read(truth, streams.generator(f"own {table}"))
-                custom[table] = readings, instrument.columns(table, readings.columns)
+        surface, motion, image_times = world.surface, flight.motion, np.array(p.image_times_s)
+        tags = clock.tags(image_times, streams.generator("image time tags"))
+        row: dict[str, Scalar] = {}
+
+        def read(
+            instrument: CustomAltimeter | CustomAttitudeSource, table: str, times_s: np.ndarray
+        ) -> InstrumentReadings:
+            """Return the readings of a custom instrument; add the columns of its parameter table to the row."""
+            truth = InstrumentTruth(
+                times_s=times_s,
+                motion=motion,
+                ground_height=lambda x, y: float(surface.height(x, y)),
+                nearest_ground=partial(first_return, surface),
+            )
+            readings = instrument.read(truth, streams.generator(f"own {table}"))
+            row.update(instrument.columns(table, readings.columns))
+            return readings
+
+        altimeter: RadarAltimeter | InstrumentReadings
+        if isinstance(p.altimeter, CustomAltimeter):
+            altimeter = read(p.altimeter, "altimeter", image_times)
+        else:
+            altimeter = RadarAltimeter.draw(p.altimeter, surface, streams.generator("altimeter"))
+        attitude_source = None if p.attitude_source is None else read(p.attitude_source, "attitude_source", tags)
         # inertial navigation from the last star reference, before entry, to the thrusters' firing
         errors = approach.errors(imu, streams.generator("approach"))
         increments = imu.increments(motion, approach.end_s, end, streams.generator("inertial noise"))
@@ -94,12 +103,10 @@ class DescentInstruments:
             approach=approach,
             imu=imu,
             navigation=InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p)),
-            altimeter=custom["altimeter"][0]
-            if isinstance(p.altimeter, CustomAltimeter)
-            else RadarAltimeter.draw(p.altimeter, world.surface, streams.generator("altimeter")),
+            altimeter=altimeter,
             tags_s=tags,
-            attitude_source=custom["attitude_source"][0] if "attitude_source" in custom else None,
-            row={name: value for _, row in custom.values() for name, value in row.items()},
+            attitude_source=attitude_source,
+            row=row,
         )
 
 

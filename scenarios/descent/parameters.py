@@ -9,7 +9,7 @@ from pydantic import Field, Tag, field_validator, model_validator
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
-from marsyard.scenarios.descent.faults import DescentFaults, add_time_fault
+from marsyard.scenarios.descent.faults import INSTRUMENT_FAULTS, DescentFaults, add_time_fault
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
@@ -23,8 +23,9 @@ from marsyard.scenarios.site_parameters import (
     SunParameters,
     complete_terrain,
     preset_terrain,
+    site_validator,
 )
-from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
+from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.scenarios.velocity import VELOCITY, check_image_size
 from marsyard.sim.dynamics.pendulum import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, SHADOW
@@ -188,7 +189,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
-        """Check terrain, binning, selected images and flight.
+        """Check terrain, binning, selected images, faults and flight.
 
         Terrain and light must come from the same site.
         """
@@ -209,6 +210,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
                 raise ValueError(
                     f"images is {self.images}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"
                 )
+        ineffective = [name for name in INSTRUMENT_FAULTS if self.exact_instruments and getattr(self.faults, name)]
+        if ineffective:
+            raise ValueError(f"faults.{ineffective[0]} has no effect with exact_instruments; allowed: 0")
         faulty_image = max(self.faults.repeated_image, self.faults.black_image)
         if faulty_image > self.images:
             raise ValueError(f"a fault affects image {faulty_image}, but the descent has only {self.images} images")

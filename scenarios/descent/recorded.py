@@ -16,8 +16,8 @@ from marsyard.sim.dynamics.pose_files import TrajectoryFileError, read_poses
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded_field
 
-#: Required duration of the flight after the last image, s.
-END_MARGIN_S = 0.5
+#: Required duration of the flight after the last image, and tolerance of its start for rounding, s.
+END_MARGIN_S, _ROUNDING_S = 0.5, 1e-9
 
 
 class FlightOrigin(Enum):
@@ -67,8 +67,7 @@ class FlightFile(UserFile, RecordedAxes):
         """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
-        # tolerance of 1e-9 s for rounding
-        if first > -self.lead_s + 1e-9 or last < max(image_times_s) + END_MARGIN_S:
+        if first > -self.lead_s + _ROUNDING_S or last < max(image_times_s) + END_MARGIN_S:
             poses = read_poses(self.file)
             begin, end = (poses.start_s + Decimal(time) for time in poses.times_s[[0, -1]].tolist())
             raise TrajectoryFileError(

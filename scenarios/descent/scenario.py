@@ -12,10 +12,11 @@ from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.case_evaluation import Score, evaluate_case
 from marsyard.scenarios.condition_columns import contrast_columns, hash_images, image_columns
-from marsyard.scenarios.descent.conditions import conditions, instrument_errors, overlap_row
+from marsyard.scenarios.descent.conditions import conditions, instrument_errors
 from marsyard.scenarios.descent.faults import add_terrain_fault
 from marsyard.scenarios.descent.flight import create_flight, gravity_m_s2, states_at_images
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
+from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.simulation import Descent, draw_detector
 from marsyard.scenarios.descent.timeline import descent_timeline
@@ -26,10 +27,9 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent
 from marsyard.scenarios.terrain_scenario import TerrainScenario
-from marsyard.scenarios.velocity import (
-    VELOCITY,
+from marsyard.scenarios.velocity import VELOCITY, run_estimator
+from marsyard.scenarios.velocity_score import (
     consistency_row,
-    run_estimator,
     stream_products,
     stream_row,
     velocity_products,

@@ -13,7 +13,7 @@ from marsyard.scenarios.descent.images import camera_optics, take_exposures
 from marsyard.scenarios.descent.measurements import DescentInstruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
-from marsyard.scenarios.velocity import Horizontal, Span
+from marsyard.scenarios.velocity_score import Horizontal, Span
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector

@@ -9,7 +9,7 @@ from marsyard.algorithms.dimes import propagate_velocity
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.descent.measurements import DescentInstruments
 from marsyard.scenarios.descent.parameters import TouchdownParameters
-from marsyard.scenarios.velocity import Horizontal
+from marsyard.scenarios.velocity_score import Horizontal
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def triple_columns(
     p: FieldTestParameters, case: TripleCase, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
     """Compute the columns of a triple: run, motion and measurement errors; `surface` is that of the true ground."""
-    run, indices = case.run, list(case.triple.image_indices)
+    run, indices, second = case.run, case.triple.image_indices, case.states[1]
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
         "run": run.flown.parameters.name,
@@ -36,10 +36,10 @@ def triple_columns(
         "noisy_cable": run.flown.parameters.cable_bursts > 0.0,
         "site": run.flown.parameters.site,
         "terrain": p.site_names.index(run.flown.parameters.site),
-        "location_east_m": float(case.states[1].position_m[0]),
-        "location_north_m": float(case.states[1].position_m[1]),
+        "location_east_m": float(second.position_m[0]),
+        "location_north_m": float(second.position_m[1]),
         **condition_columns.sun_columns(measurements.sun_direction),
-        "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
+        "horizontal_speed_m_s": float(np.hypot(*second.velocity_m_s[:2])),
     }
     errors = []
     samples = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)

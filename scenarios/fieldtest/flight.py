@@ -1,61 +1,19 @@
-"""True motion of a run of the field test: its flight, clouds and sun, and the instruments that all its cases share.
-
-The sun on Earth is computed by the method of low accuracy in Meeus, "Astronomical Algorithms" (1998), chapter 25. The
-error is 0.01 deg in this century. Refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg) are neglected.
-"""
+"""A run of the field test: its key, its flight with clouds and sun, and the camera that all its cases share."""
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 
 import numpy as np
 from jaxtyping import Float64
 
 from marsyard.scenarios.cameras import camera_optics, draw_calibrated
 from marsyard.scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
+from marsyard.scenarios.fieldtest.sun_position import sun_direction
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.helicopter import HelicopterFlight
-from marsyard.sim.frames import direction
 from marsyard.sim.render import CloudLayer
 from marsyard.sim.sensor import Detector, preset
 from marsyard.sim.streams import Streams
-
-#: Noon of 1 January 2000, and terrestrial time minus universal time in 2002, s.
-_J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
-_TT_MINUS_UT_S = 64.3
-
-
-def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3"]:
-    """Compute the unit vector to the sun's centre in the local level frame (east, north, up).
-
-    Latitude is geodetic, longitude positive to the east. Raises ValueError for a time without a time zone.
-    """
-    if time.tzinfo is None:
-        raise ValueError(f"the time {time} has no time zone; it needs one, as in 2002-10-15T12:00-07:00")
-    days = (time - _J2000).total_seconds() / 86400.0
-    t = (days + _TT_MINUS_UT_S / 86400.0) / 36525.0  # Julian centuries since J2000
-    # Meeus 25.2 to 25.8: mean longitude and anomaly, equation of centre, apparent longitude (nutation, aberration)
-    mean_longitude = 280.46646 + 36000.76983 * t + 0.0003032 * t**2
-    anomaly = np.radians(357.52911 + 35999.05029 * t - 0.0001537 * t**2)
-    equation_of_centre = (
-        (1.914602 - 0.004817 * t) * np.sin(anomaly)
-        + (0.019993 - 0.000101 * t) * np.sin(2.0 * anomaly)
-        + 0.000289 * np.sin(3.0 * anomaly)
-    )
-    node = np.radians(125.04 - 1934.136 * t)
-    longitude = np.radians(mean_longitude + equation_of_centre - 0.00569 - 0.00478 * np.sin(node))
-    obliquity = np.radians(23.4392911 - 0.0130042 * t + 0.00256 * np.cos(node))
-    right_ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
-    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
-    # mean sidereal time at Greenwich (Meeus 12.4); nutation, at most 0.005 deg, is neglected
-    sidereal = np.radians((280.46061837 + 360.98564736629 * days + longitude_deg) % 360.0)
-    hour = sidereal - right_ascension
-    latitude = np.radians(latitude_deg)
-    elevation = np.arcsin(
-        np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(hour)
-    )
-    east = -np.cos(declination) * np.sin(hour)
-    north = np.sin(declination) * np.cos(latitude) - np.cos(declination) * np.sin(latitude) * np.cos(hour)
-    return direction(float(np.arctan2(east, north)), float(elevation))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pydantic import AwareDatetime, Field, model_validator
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
-from marsyard.scenarios.terrain_files import site_validator
+from marsyard.scenarios.site_parameters import site_validator
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.error_sources import ATTITUDE, ErrorSource
@@ -158,7 +158,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     task = VELOCITY
     scored = ScoredFlight
 
-    algorithm: Annotated[str, Field(description="velocity estimator under test, see `estimators`")] = "dimes"
+    algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or custom")] = "dimes"
     runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="runs in the order of the report")]
     bank_seed: Annotated[int, Field(ge=0, description="seed of the sites' terrains; each site has one")] = 1
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side of a terrain")] = 4096

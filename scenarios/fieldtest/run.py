@@ -1,4 +1,4 @@
-"""Simulation and processing of a run."""
+"""Simulation of a run of the field test, and its processing: attitudes, altitudes and triples of its images."""
 
 from dataclasses import dataclass, replace
 
@@ -98,7 +98,7 @@ def simulate_run(key: RunKey) -> FieldRun:
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
     solution = _estimate_attitudes(flown, ground, clock, gps)
-    # another name of a random stream would change the random values
+    # "picture tags" is the name of a random stream: another name would change the random values
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))

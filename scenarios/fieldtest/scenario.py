@@ -20,7 +20,8 @@ from marsyard.scenarios.fieldtest.triples import find_triple
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.scores import ScoredFlight
 from marsyard.scenarios.terrain_scenario import TerrainScenario
-from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.velocity import VELOCITY, check_last_interval
+from marsyard.scenarios.velocity_score import consistency_row, velocity_products, velocity_row
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -68,13 +69,13 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         detector = key.detector()
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         exposures = [take_image(run.flown, scene, ground, state, detector, noise) for state in case.states]
-        images = [counts for counts, _ in exposures]
+        images, frames = zip(*exposures, strict=True)
         truth = truth_velocities(p, case)[1, :2]
         inertial = streams.generator("inertial velocity")
         measurements = measure(p, case, images, detector, key.calibrated_camera(), inertial)
         conditions = {
             **triple_columns(p, case, measurements, ground.surface),
-            **cloud_columns(case, exposures[1][1]),
+            **cloud_columns(case, second=frames[1]),
             **image_columns(p.backend, hash_images(images)),
         }
 

@@ -31,6 +31,8 @@ _CLEARANCE_M = 0.03
 _TOP_HAT_SIDES, _MIN_TOP_HAT_PX = 3.0, 3
 #: Threshold of candidates: standard deviations of the top-hat image, estimated from its quantiles.
 _THRESHOLD_SD = 5.0
+#: Maximum displacement of the predicted targets, in standard deviations of the prior attitude.
+_PRIOR_SD = 4.0
 #: Half side of the window of a centroid, divided by the side length of a target in the image.
 _WINDOW_SIDES = 1.5
 #: Maximum distance of a candidate from a predicted target, in metres on the ground: for the common displacement (the
@@ -111,7 +113,7 @@ class Sightings:
         rows = []
         for tag, position, centroids in zip(tags_s, gps_m, centroids_px, strict=True):
             is_measured = np.isfinite(centroids).all(axis=1)
-            directions = camera.rays(centroids[is_measured])[1]
+            _, directions = camera.rays(centroids[is_measured])
             offsets = targets.surveyed_m[is_measured] - position
             rows.append((np.full(len(offsets), tag), normalize(directions), normalize(offsets)))
         times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
@@ -171,8 +173,7 @@ def detect_targets(
     # distances in metres on the ground, as pixels need not be square
     tree = cKDTree(candidates / px_per_m)
     predicted = camera.project(prior.inv().apply(offsets))[0] / px_per_m
-    # search within four standard deviations of the prior
-    displacement = _find_displacement(tree, predicted, 4.0 * prior_sd_rad * height)
+    displacement = _find_displacement(tree, predicted, _PRIOR_SD * prior_sd_rad * height)
     attitude, max_distance_m = prior, _MAX_VOTE_DISTANCE_M
     predicted = predicted + displacement
     for _ in range(_ITERATIONS):
@@ -180,7 +181,7 @@ def detect_targets(
         matches = np.flatnonzero(distances < max_distance_m)
         if len(matches) < _MIN_TARGETS:
             return no_centroids
-        measured_directions = camera.rays(candidates[np.asarray(nearest)[matches]])[1]
+        _, measured_directions = camera.rays(candidates[np.asarray(nearest)[matches]])
         attitude = Rotation.align_vectors(normalize(offsets[matches]), normalize(measured_directions))[0]
         predicted, max_distance_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _MAX_FIT_DISTANCE_M
     distances, nearest = tree.query(predicted)
@@ -197,19 +198,24 @@ def find_bright_spots(
 
     - side_px: side lengths of a target in the image (columns, rows)
     """
-    size = 2 * np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int) + 1
-    top_hat = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
+    half_sides = np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int)
+    columns, rows = (2 * half_sides + 1).tolist()
+    top_hat = ndimage.white_tophat(image.astype(np.float32), size=(rows, columns))
     # 84.13 % of a normal distribution are below its mean plus one standard deviation
     median, high = np.percentile(top_hat, (50.0, 84.13))
     labels, count = ndimage.label(top_hat > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
     peaks = np.array(ndimage.maximum_position(top_hat, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
-    return _compute_centroids(top_hat, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
+    half_columns, half_rows = np.ceil(_WINDOW_SIDES * side_px).astype(np.int64)
+    return _compute_centroids(top_hat, peaks, np.array([half_rows, half_columns]))
 
 
 def _compute_centroids(
     top_hat: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half_size: Int64[np.ndarray, "2"]
 ) -> Float64[np.ndarray, "spots 2"]:
-    """Compute the centroids (column, row) of intensity in windows around peaks (row, column)."""
+    """Compute the centroids (column, row) of intensity in windows around peaks (row, column).
+
+    - half_size: half sides of the windows (rows, columns), without the pixel of the peak
+    """
     is_inside = ((peaks >= half_size) & (peaks < np.array(top_hat.shape) - half_size)).all(axis=1)
     rows, columns = np.mgrid[-half_size[0] : half_size[0] + 1, -half_size[1] : half_size[1] + 1]
     windows = top_hat[peaks[is_inside, 0, None, None] + rows, peaks[is_inside, 1, None, None] + columns].astype(
@@ -227,7 +233,8 @@ def _find_displacement(
 ) -> Float64[np.ndarray, "2"]:
     """Find the displacement that moves the largest number of predicted targets to a candidate.
 
-    The displacements from each target to the candidates within `radius_m` are tried.
+    The displacements from each target to the candidates within `radius_m` are tried; the first of equal ones is
+    returned, and zero without any candidate.
     """
     neighbours = tree.query_ball_point(predicted_m, radius_m)
     displacements = np.concatenate(

@@ -149,7 +149,7 @@ class Host:
 
 
 def construct(factory: Callable[..., Any], device: str) -> Any:
-    """Construct an algorithm; a factory with a parameter `device` receives the device."""
+    """Construct an algorithm, here or in a worker; a factory with a parameter `device` receives the device."""
     parameters: Mapping[str, Any] = {}
     with contextlib.suppress(ValueError, TypeError):  # built-in classes have no signature
         parameters = inspect.signature(factory).parameters
@@ -157,7 +157,7 @@ def construct(factory: Callable[..., Any], device: str) -> Any:
 
 
 def reset(algorithm: Any) -> None:
-    """Reset an algorithm at the start of a case, if it has the method."""
+    """Reset an algorithm, here or in a worker, at the start of a case, if it has the method."""
     if callable(getattr(algorithm, "reset", None)):
         algorithm.reset()
 
@@ -180,7 +180,7 @@ def seed_generators(seed: int) -> None:
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed(seed)
     if "cv2" in sys.modules:
-        sys.modules["cv2"].setRNGSeed(seed & 0x7FFFFFFF)
+        sys.modules["cv2"].setRNGSeed(seed & 0x7FFFFFFF)  # a signed 32-bit integer
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from marsyard.algorithms.faults import bad_answer
 
 #: Maximum bits of an integer; a float64 is below 2 ** 1024.
 _MAX_BITS = 1023
+#: Maximum number of letters of a type's name in a message.
+_MAX_NAME = 100
 #: Field of an answer that stays in the process of the algorithm.
 DETAILS = "details"
 
@@ -92,4 +94,4 @@ def _decode(value: Any, classes: Mapping[str, type]) -> Any:
 
 def _placeholder(name: str) -> object:
     """Return an object without contents, whose type has this name."""
-    return type(name[:100], (), {})()
+    return type(name[:_MAX_NAME], (), {})()

@@ -86,7 +86,7 @@ class RemoteAlgorithm:
         self._sender = Sender(child.memory_fd)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
-        child.left_s = math.inf
+        child.left_s = math.inf  # construction has a limit of its own
         answer = self._request("start", start, limits.loading_s)
         child.left_s = limits.total_s
         members = answer.get("members")
@@ -110,7 +110,7 @@ class RemoteAlgorithm:
         start_s, start_remote_s = time.process_time(), self._processor_time_s()
         layout = self._sender.send(arguments)
         answer = self._request("call", {"member": method, **asdict(layout)})
-        _Time.correction_s += self._processor_time_s() - start_remote_s
+        _Time.correction_s += max(self._processor_time_s() - start_remote_s, 0.0)
         value = decode(answer.get("value"), self._classes)
         _Time.correction_s -= time.process_time() - start_s
         return value
@@ -118,7 +118,7 @@ class RemoteAlgorithm:
     def _processor_time_s(self) -> float:
         try:
             return processor_time_s(self._process)
-        except OSError:  # the process has ended, which the next request reports
+        except OSError:  # the process has ended, which the next request reports; its time is lost
             return 0.0
 
     def _request(self, action: str, values: Mapping[str, Any], time_s: float | None = None) -> Mapping[str, Any]:

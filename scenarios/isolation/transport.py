@@ -50,7 +50,10 @@ class Sender:
 
 
 def _dump(value: Any, sent: list[Any] | None = None) -> tuple[bytes, list[pickle.PickleBuffer]]:
-    """Pickle a value with separate arrays; objects that are sent once are replaced by their index in `sent`."""
+    """Pickle a value with separate arrays.
+
+    Objects that are sent once are replaced by their index in `sent`, to which new ones are appended.
+    """
     file, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
     pickler = pickle.Pickler(file, protocol=5, buffer_callback=buffers.append)
     if sent is not None:

@@ -14,6 +14,8 @@ from marsyard.sim.sensor import height_above_ground
 #: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
 #: axis, and change of height as a fraction of the range along the optical axis.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
+#: Tolerances of these limits: flights that are exactly at a limit are within it.
+_ANGLE_TOLERANCE_DEG, _FRACTION_TOLERANCE = 0.5, 0.01
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
@@ -38,21 +40,20 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
-    # the paper's limits of tracking (section II.A); pitch, yaw and roll are the components of the rotation vector about
-    # the x, y and optical axes of the camera
+    # for the limits of tracking: components of the rotation vector about the x, y and optical axes of the camera
     pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
     # height and vertical at the first image; motion and rotation vector, body axes, to the second image
     first, second = case.flight.states
     motion = second.position_m - first.position_m
+    east, north, climb = motion
     positions = np.stack([first.position_m, second.position_m])
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
     up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
     rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
-    # the tolerances include flights that are exactly at the limits
     within_limits = (
-        roll < MAX_ROLL_DEG + 0.5
-        and max(pitch, yaw) < MAX_TILT_DEG + 0.5
-        and abs(float(motion[2])) < (MAX_HEIGHT_CHANGE_FRACTION + 0.01) * pair.axis_range_m
+        roll < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
+        and max(pitch, yaw) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
+        and abs(float(climb)) < (MAX_HEIGHT_CHANGE_FRACTION + _FRACTION_TOLERANCE) * pair.axis_range_m
     )
     return {
         "site": p.site,
@@ -61,8 +62,8 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **sun_columns(case.world.sun.direction),
         "height_m": height,
         "baseline_m": float(np.linalg.norm(motion)),
-        "height_change_fraction": float(motion[2] / height),
-        "baseline_fraction": float(np.hypot(*motion[:2]) / height),
+        "height_change_fraction": float(climb / height),
+        "baseline_fraction": float(np.hypot(east, north) / height),
         "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
         **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),

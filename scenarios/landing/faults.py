@@ -39,7 +39,10 @@ class LandingFaults(SizedFaults):
     ] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
-        """Return the detector parameters that the faults change; listed bad pixels are filled by the camera."""
+        """Return the detector parameters that the faults change.
+
+        The larger of the fractions of listed and unlisted bad pixels is used; the camera fills listed ones.
+        """
         fraction = max(self.bad_pixels, self.listed_bad_pixels)
         is_listed = fraction == self.listed_bad_pixels
         defects = {"dead_fraction": fraction, "hot_fraction": fraction, "listed": is_listed} if fraction else {}

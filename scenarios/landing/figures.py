@@ -28,6 +28,13 @@ from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.render import Scene
 from marsyard.sim.sensor import height_above_ground
 
+#: Time between the poses of a path, s.
+_STEP_S = 0.1
+#: Half width of the shown ground divided by the height of the first image.
+_HALF_WIDTH_RATIO = 1.5
+#: Colours of the landing map, RGB; as in the paper's figures.
+_COLOURS = {Safety.SAFE: (60, 160, 70), Safety.UNKNOWN: (225, 200, 70), Safety.HAZARD: (200, 50, 45)}
+
 
 def case_products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     """Return the arrays for the case's figures.
@@ -65,14 +72,6 @@ def case_products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any
     }
     site = true_site(estimate, flight)
     return arrays if site is None else {**arrays, "site_true": site}
-
-
-#: Time between the poses of a path, s.
-_STEP_S = 0.1
-#: Half width of the shown ground divided by the height of the first image.
-_HALF_WIDTH_RATIO = 1.5
-#: Colours of the landing map, RGB; as in the paper's figures.
-_COLOURS = {Safety.SAFE: (60, 160, 70), Safety.UNKNOWN: (225, 200, 70), Safety.HAZARD: (200, 50, 45)}
 
 
 def landing_timeline(case: RenderedFlight, estimate: SiteEstimate, touchdown: Touchdown | None) -> Timeline:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
-from scipy.spatial.transform import RigidTransform, Rotation
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.cameras import draw_calibrated
 from marsyard.scenarios.landing.faults import add_range_faults, add_receiver_outage, draw_received_images
-from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
+from marsyard.scenarios.landing.pair_choice import choose_pair
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.views import nadir_pose
-from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
@@ -23,8 +21,10 @@ from marsyard.sim.sensor.altimeters import RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Minimum time between the two images, s; applies to a camera at rest.
-MIN_INTERVAL_S = 0.1
+#: Minimum time between the two images, s, and minimum speed from which it follows, m/s.
+MIN_INTERVAL_S, MIN_SPEED_M_S = 0.1, 1e-6
+#: Largest range of the laser's echo divided by the commanded height.
+MAX_RANGE_HEIGHTS = 5.0
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,19 @@ class LandingFlight:
     @classmethod
     def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> LandingFlight:
         """Create the flight of a case: choose a pair from a helicopter flight, or use the poses of the parameters."""
-        if p.helicopter is None:
-            states = true_states(p, surface, streams)
-            upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-            tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
-            up_body = Rotation.from_rotvec(tilt).apply(upright)
-            return cls(states, measure_poses(p, states, streams), up_body)
-        helicopter = add_receiver_outage(p.faults, p.helicopter)
+        if p.helicopter is not None:
+            return cls._from_helicopter(p, add_receiver_outage(p.faults, p.helicopter), surface, streams)
+        states = true_states(p, surface, streams)
+        upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+        tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
+        up_body = Rotation.from_rotvec(tilt).apply(upright)
+        return cls(states, measure_poses(p, states, streams), up_body)
+
+    @classmethod
+    def _from_helicopter(
+        cls, p: LandingScenarioParameters, helicopter: LandingHelicopterParameters, surface: Surface, streams: Streams
+    ) -> LandingFlight:
+        """Fly a helicopter, and choose two of its images."""
         ground = float(surface.height(p.location.east_m, p.location.north_m))
         height = helicopter.transit.height_m
         start_m = np.array([p.location.east_m, p.location.north_m, ground + height])
@@ -56,11 +62,11 @@ class LandingFlight:
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
-        # laser ranges to the ground, without rocks, at all images; no echo beyond five times the height
+        # laser ranges to the ground, without rocks, at all images
         motion = transit.flight.path.motion(transit.times_s)
         laser = RangingUnit.draw(p.laser, streams.generator("laser"))
         true_ranges = [
-            range_along(surface, position, axis, 5.0 * height)
+            range_along(surface, position, axis, MAX_RANGE_HEIGHTS * height)
             for position, axis in zip(motion.positions_m, motion.attitudes.apply(laser.axis), strict=True)
         ]
         readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
@@ -94,7 +100,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     course = np.radians(pair.heading_deg + pair.course_deg)
     distance = pair.baseline_fraction * pair.height_m
     step = np.array([distance * np.sin(course), distance * np.cos(course), pair.climb_fraction * pair.height_m])
-    interval = max(float(np.linalg.norm(step)) / max(pair.speed_m_s, 1e-6), MIN_INTERVAL_S)
+    interval = max(float(np.linalg.norm(step)) / max(pair.speed_m_s, MIN_SPEED_M_S), MIN_INTERVAL_S)
     velocity = pair.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
     rates = np.radians(pair.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
     start = np.array(first.translation)
@@ -111,12 +117,10 @@ def measure_poses(
     deviations, rng = p.navigation, streams.generator("navigation")
     position = deviations.position_m * rng.standard_normal(3)
     motion = deviations.motion_m * rng.standard_normal(3)
-    tilt, azimuth = (
-        np.radians(deviations.tilt_deg) * rng.standard_normal(2),
-        np.radians(deviations.azimuth_deg) * rng.standard_normal(),
-    )
+    tilt_x, tilt_y = np.radians(deviations.tilt_deg) * rng.standard_normal(2)
+    azimuth = np.radians(deviations.azimuth_deg) * rng.standard_normal()
     rotation_error = np.radians(deviations.rotation_deg) * rng.standard_normal(3)
-    common_rotation = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
+    common_rotation = Rotation.from_rotvec(np.array([tilt_x, tilt_y, azimuth]))
     positions = (position, position + motion)
     rotations = (common_rotation, Rotation.from_rotvec(rotation_error) * common_rotation)
     first, second = (
@@ -124,66 +128,3 @@ def measure_poses(
         for state, offset, rotation in zip(states, positions, rotations, strict=True)
     )
     return first, second
-
-
-@dataclass(frozen=True)
-class PairChoice:
-    """Indices of the chosen images, their baseline perpendicular to the first optical axis, and their overlap."""
-
-    first: int
-    second: int
-    baseline_m: float
-    overlap: float
-
-
-def choose_pair(
-    poses: Sequence[PoseMeasurement],
-    ranges_m: Float64[np.ndarray, "n"],
-    camera: CameraModel,
-    parameters: PairParameters,
-    height_m: float,
-) -> PairChoice:
-    """Choose the pair with the highest score; among equal scores, the earliest pair (landing paper, section V).
-
-    The choice uses on-board data: poses of the filter, ranges of the laser, and the calibrated camera; level ground is
-    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap` are used only if
-    no pair has this overlap.
-
-    Raises ValueError if there are fewer than two images.
-    """
-    if len(poses) < 2:
-        raise ValueError(f"cannot choose a pair from {len(poses)} images; at least 2 are needed")
-    columns, rows = camera.size
-    rays = camera.rays(np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5)[1]
-    transforms = RigidTransform.concatenate([pose.world_from_body for pose in poses])
-    centres_m, axes = transforms.apply(np.array(camera.c)), transforms.rotation.apply(np.array(camera.a))
-    corner_rays = np.stack([transforms.rotation.apply(ray) for ray in rays], axis=1)
-    best, best_score = None, (False, -np.inf)
-    for first, axis in enumerate(axes[:-1]):
-        distance = float(ranges_m[first]) if np.isfinite(ranges_m[first]) else height_m
-        steps_m = centres_m[first:] - centres_m[first]
-        baselines_m = np.linalg.norm(steps_m - (steps_m @ axis)[:, None] * axis, axis=1)
-        footprints = _level_footprints(corner_rays[first:], steps_m, distance * axis[2])
-        area = cv2.contourArea(footprints[0])
-        for k in range(1, len(footprints)):
-            # an image that shows the horizon has no footprint
-            has_overlap = np.isfinite(footprints[[0, k]]).all()
-            overlap = cv2.intersectConvexConvex(footprints[0], footprints[k])[0] / area if has_overlap else 0.0
-            is_usable = bool(overlap >= parameters.min_overlap)
-            score = overlap * min(baselines_m[k] / (parameters.max_baseline_fraction * distance), 1.0)
-            if (is_usable, score) > best_score:
-                best_score = (is_usable, score)
-                best = PairChoice(first, first + k, float(baselines_m[k]), overlap)
-    if best is None:
-        raise ValueError("no pair of images has finite poses")
-    return best
-
-
-def _level_footprints(
-    corner_rays: Float64[np.ndarray, "n 4 3"], centres_m: Float64[np.ndarray, "n 3"], level_m: float
-) -> Float32[np.ndarray, "n 4 2"]:
-    """Project the corners of images onto a level plane; NaN for an image with a corner at or above the horizon."""
-    below = np.all(corner_rays[..., 2] < 0.0, axis=1)
-    heights = np.where(below, level_m - centres_m[:, 2], np.nan)
-    distances = heights[:, None] / corner_rays[..., 2]
-    return np.asarray(centres_m[:, None, :2] + distances[..., None] * corner_rays[..., :2], dtype=np.float32)

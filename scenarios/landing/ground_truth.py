@@ -92,9 +92,8 @@ class GroundTruth:
         if not np.any(self.visible_hazards):
             return float("nan")
         distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
-        row, column = divmod(
-            int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1]
-        )
+        nearest = int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T)))
+        row, column = np.unravel_index(nearest, distances.shape)
         is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
         largest = float(distances.max())
         return 0.0 if is_outside or largest == 0.0 else float(distances[row, column]) / largest

@@ -73,7 +73,10 @@ def _fit_weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Arr
 
 @njit(cache=True)
 def _fit_least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> Array:
-    """Fit a plane of least absolute deviations by iteratively reweighted least squares: value at (0, 0) and slopes."""
+    """Fit a plane of least absolute deviations by iteratively reweighted least squares: value at (0, 0) and slopes.
+
+    `weights` is memory for the weights of the points; its values are overwritten.
+    """
     plane, previous = np.empty(3), np.empty(3)
     weights[:] = 1.0
     _fit_weighted_plane(x, y, z, weights, plane)

@@ -44,8 +44,7 @@ from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters, sit
 RATE = ErrorSource("motion", "motion: attitude rate")
 POSE_POSITION = ErrorSource("position", "position and motion")
 POSE_ATTITUDE = ErrorSource("attitude", "attitude and inclinometers")
-
-
+#: Angles in degrees.
 Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
 
 

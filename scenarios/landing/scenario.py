@@ -16,6 +16,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing import score
 from marsyard.scenarios.landing.conditions import conditions
 from marsyard.scenarios.landing.figures import case_products, landing_timeline
+from marsyard.scenarios.landing.map_score import map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import motion_row, times_row
 from marsyard.scenarios.landing.simulation import RenderedFlight, measure
@@ -71,7 +72,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **score.site_row(estimate, flight, truth),
                 **score.landing_row(touchdown, estimate, flight, truth),
                 **motion_row(estimate.details, flight, case.pair),
-                **score.map_row(p, estimate, flight, truth),
+                **map_row(p, estimate, flight, truth),
                 **times_row(estimate.details),
             }
             scored = None

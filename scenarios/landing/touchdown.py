@@ -18,11 +18,14 @@ from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Transit
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.dynamics import Resting, State, rotorcraft
+from marsyard.sim.dynamics.rotorcraft import kernels
 from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
 
 #: Maximum number of iterations of a landing, and maximum change of the path at convergence, metres.
 MAX_ITERATIONS, MAX_PATH_CHANGE_M = 8, 1e-3
+#: Columns of the position in the rows of a simulated path.
+_POSITION = slice(kernels.POSITION, kernels.VELOCITY)
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,8 @@ def land(
 ) -> Touchdown | None:
     """Continue a transit to a site in estimated coordinates and land; None without ground contact in time.
 
-    `ground` contains the true heights around the site, including rocks. `laser_stuck_m` is the altimeter's stuck range.
+    `ground` contains the true heights around the site, including rocks. `laser_stuck_m` is the altimeter's stuck
+    range: infinite if it returns no range, None if it has no fault.
     """
     p, path = transit.parameters, transit.flight.path
     noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
@@ -79,7 +83,7 @@ def land(
     transit_errors = _interpolate_at_knots(
         path, transit.navigation_leg.boundaries_s, transit.navigation_leg.errors(path)
     )
-    errors, previous, end = transit_errors, None, None
+    errors, previous_m, end = transit_errors, None, None
     iterations, path_change_m, initial = 0, np.inf, transit.navigation_leg.solution.end
     while iterations < MAX_ITERATIONS and path_change_m > MAX_PATH_CHANGE_M:
         flight = rotorcraft.simulate_landing(
@@ -90,8 +94,9 @@ def land(
         navigation_leg = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)
         leg_errors = _interpolate_at_knots(path, navigation_leg.boundaries_s, navigation_leg.errors(path))
         errors = np.concatenate([transit_errors, leg_errors[len(transit_errors) :]])
-        path_change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
-        previous, iterations = path, iterations + 1
+        positions_m = path.rows[:, _POSITION]
+        path_change_m = np.inf if previous_m is None else float(np.abs(positions_m - previous_m).max())
+        previous_m, iterations = positions_m, iterations + 1
     time = flight.phase_start_s(rotorcraft.Phase.ON_GROUND)
     if time is None:
         return None

@@ -29,6 +29,8 @@ HALF_WELL_SNR = 80.0
 _READ_NOISE_E = 10.0
 _EXPOSURE_S = 150e-6
 _BITS = 8
+#: Tolerance of the angle at the image's edge, radians: rounding errors of inverting the lens.
+_EDGE_TOLERANCE_RAD = 1e-4
 
 
 class LanderCameraParameters(Parameters):
@@ -57,7 +59,8 @@ class LanderCameraParameters(Parameters):
         _, ((_, _, z),) = camera.rays(edge)
         angle = np.arccos(-z)  # from the optical axis, -z
         # a distortion that is not monotonic has the angle of another point at the edge
-        if not np.all(np.isfinite(camera.corner_rays()[1])) or not abs(angle - 0.5 * np.radians(self.field_deg)) < 1e-4:
+        is_exact = abs(angle - 0.5 * np.radians(self.field_deg)) < _EDGE_TOLERANCE_RAD
+        if not (is_exact and np.all(np.isfinite(camera.corner_rays()[1]))):
             raise ValueError(
                 f"field_deg of {self.field_deg:.6g} with {self.pixels} pixels of {self.pixel_mrad:.6g} mrad is not a "
                 f"one-to-one image; allowed: a field close to pixels x pixel_mrad"
@@ -109,6 +112,7 @@ def _full_well_e() -> float:
 
 
 def _create_detector() -> DetectorParameters:
+    """Create the detector of the lander's camera (see `LANDER_DETECTOR`)."""
     full_well = _full_well_e()
     pitch_um = LanderCameraParameters().pixel_pitch_um
     light = LightPath(f_number=2.7, pixel_pitch_um=pitch_um, band_nm=(400.0, 900.0))

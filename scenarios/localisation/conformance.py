@@ -45,6 +45,10 @@ _TEXTURE_STEP_M, _MAP_PIXEL_M, _MAP_PX = 12.0, 6.0, 640
 _MEAN_DN, _OFFSET_DN, _FULL_SCALE_DN = 110.0, 2.0, 255
 #: Jitter of the time tags: images and altitudes, s; inertial data, as a fraction of the interval.
 _TAG_JITTER_S, _IMU_JITTER = 0.005, 0.4
+#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.
+_TIME_TOLERANCE_S = 1e-6
+#: Index of a boundary of the increments whose tag is equal to the next one.
+_EQUAL_TAG = 50
 
 #: Counts of the blank images of this suite; `black` is below the offset.
 BLANK_COUNTS: dict[str, Blank] = {**BLANKS, "black": lambda _: 0}
@@ -83,7 +87,7 @@ def descent_with_jitter() -> LocalisationMeasurements:
     tags = increments.times_s + _IMU_JITTER / _IMU_HZ * rng.uniform(-1.0, 1.0, increments.times_s.size)
     tags[[0, -1]] = increments.times_s[[0, -1]]
     tags = np.maximum.accumulate(tags)
-    tags[50] = tags[51]
+    tags[_EQUAL_TAG] = tags[_EQUAL_TAG + 1]
     images = [replace(image, time_s=image.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for image in case.images]
     altitudes = [replace(item, time_s=item.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for item in case.altitudes]
     altitudes[1] = replace(altitudes[1], time_s=images[0].time_s)
@@ -138,10 +142,6 @@ def _map() -> MapProduct:
     samples = np.stack(np.meshgrid(offsets, offsets, indexing="ij")) / _TEXTURE_STEP_M
     appearance = map_coordinates(texture(), samples, order=1, mode="grid-wrap").astype(np.float32)
     return MapProduct(appearance, np.zeros_like(appearance), np.full(2, offsets[0]), _MAP_PIXEL_M, 1.0, 1.0, 1.0)
-
-
-#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.
-_TIME_TOLERANCE_S = 1e-6
 
 
 def check_answers(answer: Any, measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:

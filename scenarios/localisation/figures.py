@@ -26,8 +26,10 @@ from marsyard.scenarios.timeline import (
 )
 from marsyard.scenarios.timeline_surface import grey_values, surface_from_above
 
-#: Side of the stored map, pixels.
-_THUMBNAIL_PX = 512
+#: Side of the stored map, pixels, and quantiles of its appearance that become black and white.
+_THUMBNAIL_PX, _BLACK_QUANTILE, _WHITE_QUANTILE = 512, 0.005, 0.995
+#: Step between the map's pixels for these quantiles.
+_QUANTILE_STEP = 4
 #: Half width of the shown ground divided by the altitude at the start.
 _HALF_WIDTH_RATIO = 1.2
 #: Time between the poses of the true path, s, and maximum side of the shown map, pixels.
@@ -41,7 +43,7 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
 
         track               per estimate: time, error east, north, up, sd east, north, up (m); NaN for a refusal
         outcomes            outcome of each estimate
-        inliers             landmarks used in each image; NaN without a match
+        inliers             per estimate: landmarks used; NaN without a match
         true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
         initial_xy_m        initial position (east, north) of inertial navigation
         map                 appearance of the map, reduced; map_extent_m: west, east, south, north
@@ -50,16 +52,17 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
                             landmarks_used: whether the position uses them
     """
     errors = compute_errors(descent, answers)
-    nothing = np.full(7, np.nan)
+    refusal = np.full(1 + 3 + 3, np.nan)  # time, position error and its standard deviation
     track = np.stack(
-        [nothing if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
+        [refusal if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
     )
     estimates = answers.estimates
     details = [estimate.details for estimate in estimates]
     estimated = [np.full(2, np.nan) if item.position_m is None else item.position_m[:2] for item in estimates]
     map_product = descent.measurements.map_product
     side_px = min(_THUMBNAIL_PX, *map_product.appearance.shape)
-    low, high = np.quantile(map_product.appearance[::4, ::4], (0.005, 0.995))
+    sampled = map_product.appearance[::_QUANTILE_STEP, ::_QUANTILE_STEP]
+    low, high = np.quantile(sampled, (_BLACK_QUANTILE, _WHITE_QUANTILE))
     scaled = np.clip(255.0 * (map_product.appearance - low) / max(float(high - low), 1e-9), 0.0, 255.0)
     thumbnail = cv2.resize(scaled.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_AREA)
     west, south = map_product.origin_m - 0.5 * map_product.pixel_m
@@ -83,7 +86,7 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
     }
     if descent.images:
         values |= {"image_1": descent.images[0].counts, "image_2": descent.images[-1].counts}
-    last = details[-2] if len(details) > 1 else None
+    last = _details_by_image(descent, answers).get(len(descent.images) - 1)
     if isinstance(last, LocalisationDetails) and last.measured_px is not None:
         values |= {
             "landmarks_px": last.measured_px,
@@ -91,6 +94,12 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
             "landmarks_used": last.used,
         }
     return values
+
+
+def _details_by_image(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[int, object]:
+    """Return the details of the estimates by the index of the image; estimators answer in the order of time tags."""
+    by_tag = np.argsort([image.time_s for image in descent.images], kind="stable")
+    return {int(index): answer.details for index, answer in zip(by_tag, answers.after_images, strict=True)}
 
 
 def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> Timeline:
@@ -177,12 +186,9 @@ def _error_series(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
 def _images(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> list[TimedImage]:
     """Return the delivered images at the true times of their exposures, with the landmarks that were matched."""
     camera, images = true_camera(descent.p.camera), []
-    # an estimator receives the images in the order of their time tags; the last estimate belongs to no image
-    estimates = () if answers is None else answers.after_images
-    by_tag = np.argsort([image.time_s for image in descent.images], kind="stable")
-    details_of = {int(index): estimate.details for index, estimate in zip(by_tag, estimates, strict=False)}
+    details_by_image = {} if answers is None else _details_by_image(descent, answers)
     for number, (image, state) in enumerate(zip(descent.images, descent.image_states, strict=True)):
-        details, marks = details_of.get(number), {}
+        details, marks = details_by_image.get(number), {}
         if isinstance(details, LocalisationDetails) and details.measured_px is not None and details.used is not None:
             marks = {
                 "landmarks used": details.measured_px[details.used],

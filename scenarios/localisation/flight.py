@@ -58,7 +58,9 @@ _MIN_SPEED_FRACTION = 0.5
 _UP = np.array([0.0, 0.0, 1.0])
 #: Signs of the conjugate of a quaternion.
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
-
+#: Elements of the integrated state of the powered descent.
+_POSITION, _VELOCITY, _ACCELERATION, _JERK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+_ATTITUDE, _BODY_RATE = slice(12, 16), slice(16, 19)
 #: Upper limit of `SwingParameters.thruster_firing_m`.
 _MAX_FIRING_M = 1000.0
 #: Mars 2020 under its parachute, a rigid vehicle with its backshell: coning with the parachute, and nodding about the
@@ -218,11 +220,11 @@ def _fly_powered(
     last_height_m = ground_height_m + p.altitude_end_m - BELOW_END_M
 
     def derivative(time_s: float, y: Float64[np.ndarray, "19"]) -> Float64[np.ndarray, "19"]:
-        velocity, acceleration, jerk, quaternion, rate = y[3:6], y[6:9], y[9:12], y[12:16], y[16:]
-        guidance = np.empty(3)
-        guidance[:2] = _limit(-p.velocity_gain_per_s * velocity[:2], p.max_horizontal_m_s2)
-        sink = np.array([p.velocity_gain_per_s * (-p.descent_speed_m_s - velocity[2])])
-        guidance[2:] = _limit(sink, p.max_vertical_m_s2)
+        velocity, acceleration, jerk = y[_VELOCITY], y[_ACCELERATION], y[_JERK]
+        quaternion, rate = y[_ATTITUDE], y[_BODY_RATE]
+        horizontal = _limit(-p.velocity_gain_per_s * velocity[:2], p.max_horizontal_m_s2)
+        vertical = p.velocity_gain_per_s * (-p.descent_speed_m_s - velocity[2:])
+        guidance = np.concatenate([horizontal, _limit(vertical, p.max_vertical_m_s2)])
         weight = _smooth_step((time_s - separation_s - p.free_fall_s) / p.start_up_s)
         command = weight * guidance - (1.0 - weight) * gravity_m_s2 * _UP
         snap = p.thrust_lag_rad_s**2 * (command - acceleration) - 2.0 * p.thrust_lag_rad_s * jerk
@@ -233,7 +235,7 @@ def _fly_powered(
         return np.concatenate([velocity, acceleration, jerk, snap, turn, rate_slope])
 
     def height_left(_time_s: float, y: Float64[np.ndarray, "19"]) -> float:
-        return float(y[2]) - last_height_m
+        return float(y[_POSITION][2]) - last_height_m
 
     height_left.terminal = True  # type: ignore[attr-defined]
     max_s = (initial.position_m[2] - last_height_m) / (_MIN_SPEED_FRACTION * p.descent_speed_m_s)
@@ -251,8 +253,9 @@ def _fly_powered(
         events=(height_left,),
     )
     if not solution.event_terminated:
+        height_m = solution.y[_POSITION][2, -1]
         raise ValueError(
-            f"the powered descent is at z = {solution.y[2, -1]:.1f} m after {max_s:.6g} s; allowed: parameters with "
+            f"the powered descent is at z = {height_m:.1f} m after {max_s:.6g} s; allowed: parameters with "
             f"which it reaches {last_height_m:.1f} m"
         )
     times = _knots(separation_s, float(solution.t[-1]))
@@ -261,7 +264,8 @@ def _fly_powered(
     elapsed = (times - separation_s)[:, None]
     angles = np.radians(p.limit_cycle_deg) * np.sin(2.0 * np.pi * elapsed / (p.limit_cycle_s * _CYCLE_RATIOS) + phases)
     cycle = Rotation.from_rotvec(_smooth_step(elapsed / p.limit_cycle_s) * angles)
-    return _Poses(times, np.ascontiguousarray(states[:, :3]), Rotation.from_quat(states[:, 12:16]) * cycle)
+    attitudes = Rotation.from_quat(states[:, _ATTITUDE])
+    return _Poses(times, np.ascontiguousarray(states[:, _POSITION]), attitudes * cycle)
 
 
 def _limit(values: Float64[np.ndarray, "k"], maximum: float) -> Float64[np.ndarray, "k"]:

@@ -91,12 +91,10 @@ def orbital_rays(
     north: Float64[np.ndarray, "rows columns"],
     aperture_m: float,
 ) -> PixelRays:
-    """Compute the rays from an orbiter to the surface points at world x, y, in world axes.
+    """Compute the rays from an orbiter to the surface points at world x, y (`east`, `north`), in world axes.
 
-    `aperture_m` is the width of the ground that each of them averages.
-
-    Rays are in single precision: at 300 km and up to 1.2 deg from nadir a position on the ground is exact to a
-    millimetre.
+    `aperture_m` is the width of the ground that each of them averages. Rays are in single precision: at 300 km and up
+    to 1.2 deg from nadir a position on the ground is exact to a millimetre.
     """
     rows, columns = east.shape
     directions = np.empty((rows, columns, 3), dtype=np.float32)
@@ -109,7 +107,7 @@ def orbital_rays(
         directions[block] = vectors / distance[..., None]
         angles[block] = aperture_m / distance
     border = [directions[0], directions[-1], directions[:, 0], directions[:, -1]]
-    radius = max(float(np.abs(rays[:, :2] / rays[:, 2:]).max()) for rays in border)
+    max_tangent = max(float(np.abs(rays[:, :2] / rays[:, 2:]).max()) for rays in border)
     return PixelRays(
         centre=np.zeros(3),
         origins=np.zeros((rows * columns, 3), dtype=np.float32),
@@ -118,7 +116,7 @@ def orbital_rays(
         pixel_angles=angles.ravel(),
         view_side_px=_VIEW_SIDE_PX,
         view_from_body=np.diag([1.0, -1.0, -1.0])[None],
-        focal_px=np.array([(0.5 - _VIEW_MARGIN) * _VIEW_SIDE_PX / radius]),
+        focal_px=np.array([(0.5 - _VIEW_MARGIN) * _VIEW_SIDE_PX / max_tangent]),
         view_of_pixel=np.zeros(rows * columns, dtype=np.uint8),
     )
 

@@ -49,16 +49,16 @@ class SmoothField:
         White noise is filtered by a Gaussian kernel; the spline is part of the kernel.
         """
         spacing = length_m / POINTS_PER_LENGTH
-        # a cubic spline needs control values beyond the extent: two on each side
-        columns, rows = (np.ceil((np.asarray(high_m) - low_m) / spacing).astype(int) + 5).tolist()
+        # one control value more than intervals, and two beyond each end of the extent, which a cubic spline needs
+        columns, rows = (np.ceil((np.asarray(high_m) - low_m) / spacing).astype(int) + 1 + 2 * 2).tolist()
         # two kernels with the variance length**2 / 2 give the correlation function
         kernel_sd = np.sqrt(0.5 * POINTS_PER_LENGTH**2 - _SPLINE_VARIANCE)
         extent = int(np.ceil(_KERNEL_EXTENT * kernel_sd))
         kernel = np.exp(-0.5 * (np.arange(-extent, extent + 1) / kernel_sd) ** 2)
         kernel /= np.sqrt(np.sum(np.convolve(kernel, _SPLINE_AT_KNOTS) ** 2))
         noise = rng.standard_normal((rows + 2 * extent, columns + 2 * extent))
-        rows = scipy.signal.oaconvolve(noise, kernel[:, None], mode="valid")
-        control = scipy.signal.oaconvolve(rows, kernel[None, :], mode="valid")
+        along_y = scipy.signal.oaconvolve(noise, kernel[:, None], mode="valid")
+        control = scipy.signal.oaconvolve(along_y, kernel[None, :], mode="valid")
         return cls(sd * control, np.asarray(low_m, dtype=np.float64) - 2.0 * spacing, spacing)
 
     def at(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float64[np.ndarray, "*batch"]:

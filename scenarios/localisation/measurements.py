@@ -15,7 +15,8 @@ from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuInc
 class LocalisationMeasurements:
     """All measurements of a descent, with the initial state and the map: the inputs of a position estimator.
 
-    - images, altitudes: in the order of their time tags; lost images and missing readings are omitted
+    - images, altitudes: in the order of their true times, which that of the time tags can differ from; lost images and
+      missing readings are omitted
     """
 
     initial: InitialState

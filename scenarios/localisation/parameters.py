@@ -15,7 +15,8 @@ from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.localisation import instruments
 from marsyard.scenarios.localisation.camera import LANDER_DETECTOR, LanderCameraParameters
 from marsyard.scenarios.localisation.flight import ProfileParameters
-from marsyard.scenarios.localisation.instruments import INERTIAL_MARGIN_S, InitialErrors
+from marsyard.scenarios.localisation.initial_state import InitialErrors
+from marsyard.scenarios.localisation.instruments import INERTIAL_MARGIN_S
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.site_parameters import DustOpacity, Location, RenderParameters, SunParameters, complete_terrain

@@ -30,9 +30,9 @@ from marsyard.sim.sensor.altimeters import RadarAltimeter
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.streams import Streams
 
-#: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The
-#: span is longer if the error of a clock moves a time tag out of it.
-LEAD_S, MARGIN_S = 0.2, 0.2
+#: The inertial data begin and end this long before the start of localisation and after the last image, s. The span is
+#: longer if the error of a clock moves a time tag out of it.
+INERTIAL_LEAD_S, INERTIAL_TAIL_S = 0.2, 0.2
 #: Minimum height of a camera for which the ground's mesh is made, m: a lower one needs no finer first guess.
 _MIN_HEIGHT_M = 50.0
 #: Index of the terrain that a wrong map shows, minus the index of the case's terrain.
@@ -162,8 +162,8 @@ def _take_images(
 
 def _inertial_span(flight: LanderFlight, last_s: float, tags_s: Sequence[float]) -> tuple[float, float]:
     """Return the span of the inertial data: around all time tags, as far as the flight is simulated."""
-    start_s = min(-LEAD_S, min(tags_s, default=0.0) - INERTIAL_MARGIN_S)
-    end_s = max(last_s + MARGIN_S, max(tags_s, default=0.0) + INERTIAL_MARGIN_S)
+    start_s = min(-INERTIAL_LEAD_S, min(tags_s, default=0.0) - INERTIAL_MARGIN_S)
+    end_s = max(last_s + INERTIAL_TAIL_S, max(tags_s, default=0.0) + INERTIAL_MARGIN_S)
     first_s, final_s = flight.span_s
     return max(start_s, first_s), min(end_s, final_s)
 

@@ -5,9 +5,13 @@ from dataclasses import replace
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Column, ColumnKind, Columns, condition, error, flag, outcome, text
 
-_CASE = (
+_IDENTITY = (
     text("measured_case", "name of the case"),
     text("image_hash", "hash of the counts of all images", ColumnKind.PROVENANCE),
+)
+#: Columns of a case of two or more images.
+_CASE = (
+    *_IDENTITY,
     condition("images", "number of images"),
     condition("duration_s", "time from the first to the last image"),
     condition("max_rotation_deg", "largest rotation between two images", "largest rotation between two images"),
@@ -57,7 +61,7 @@ def _map_columns(prefix: str, whose: str) -> tuple[Column, ...]:
 
 MAP_COLUMNS = Columns(
     (
-        *_CASE[:2],
+        *_IDENTITY,
         *_map_columns("", "recorded image"),
         text("rendered.outcome", "outcome of the rendered image", ColumnKind.OUTCOME),
         *_map_columns("rendered.", "rendered image"),

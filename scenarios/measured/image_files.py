@@ -1,6 +1,7 @@
-"""Read the images, maps and flat fields of `marsyard ingest`: PNG, PGM and TIFF of one band with 8 or 16 bits.
+"""Read the files of `marsyard ingest`: images, maps and flat fields as PNG, PGM or TIFF of one band with 8 or 16 bits.
 
-Those of the task `map` can also be JPEG, and in colour: published copies usually are.
+Images and maps of the task `map` can also be JPEG, and in colour: published copies usually are. Elevations, and flat
+fields of real numbers, are `.npy` arrays.
 """
 
 import warnings

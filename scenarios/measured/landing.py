@@ -20,12 +20,11 @@ from marsyard.scenarios.hda_stage_columns import motion_errors, stage_row
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.matching import (
+from marsyard.scenarios.measured.matching import case_row, distance
+from marsyard.scenarios.measured.pose_agreement import (
     agreement_products,
     agreement_row,
-    case_row,
     compare_with_poses,
-    distance,
     match_images,
 )
 from marsyard.scenarios.measured.store import MeasuredParameters

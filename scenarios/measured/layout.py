@@ -281,6 +281,6 @@ def _parse_row(line: int, cells: Mapping[str, str]) -> ImageRow:
         if abs(length - 1.0) > _QUATERNION_TOLERANCE:
             raise ValueError(
                 f"the quaternion {prefix}qx to {prefix}qw has the length {length:.4g}; "
-                f"allowed: 1 to {_QUATERNION_TOLERANCE:g}"
+                f"allowed: 1, within {_QUATERNION_TOLERANCE:g}"
             )
     return row

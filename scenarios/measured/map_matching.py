@@ -9,6 +9,7 @@ that were searched.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,8 +38,12 @@ MATCHERS = ("template", "sift", "orb", "lvs")
 TOLERANCE_PX = 2.5
 #: Minimum number of templates that agree with a homography (as in the statistics of image pairs).
 _MIN_INLIERS = 12
-#: Side of the squares in which an image is resampled; spacing and search range of the templates: map pixels (assumed).
-_TILE_PX, _TEMPLATE_PX, _TEMPLATE_STEP_PX, _SEARCH_PX = 16, 31, 16, 12
+#: Iterations and confidence of RANSAC: enough for 15 % of inliers.
+_RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 20_000, 0.9999
+#: Side of the squares in which an image is resampled, map pixels (assumed).
+_TILE_PX = 16
+#: Side, spacing and search range (in each direction) of the templates, map pixels (assumed).
+_TEMPLATE_PX, _TEMPLATE_STEP_PX, _SEARCH_PX = 31, 16, 12
 #: Area for each feature of SIFT and of ORB, map pixels (assumed): both find so many in images from Mars.
 _FEATURE_AREA_PX = 300
 #: Fraction of the templates with the largest Harris interest on the map that are the strong ones (assumed).
@@ -77,6 +82,13 @@ class MapComparison:
     row: dict[str, Scalar]
 
 
+class _Matched(NamedTuple):
+    """Numbers of templates, features or landmarks: correctly matched ones, and all that were searched on the map."""
+
+    correct: int
+    searched: int
+
+
 def compare_with_map(
     image: PosedImage, map_product: MapProduct, position_sd_m: float, options: LvsOptions
 ) -> MapComparison:
@@ -89,8 +101,8 @@ def compare_with_map(
     corrected = image.correct(matches.translation_m, matches.rotation_rad)
     nan = float("nan")
     residuals_px = np.hypot(*matches.residuals_px.T) / matches.working_pixel
-    results: dict[str, tuple[int, int]] = dict.fromkeys(MATCHERS, (0, 0))
-    results["lvs"] = (len(matches), matches.attempted)
+    results = dict.fromkeys(MATCHERS, _Matched(correct=0, searched=0))
+    results["lvs"] = _Matched(len(matches), matches.attempted)
     row: dict[str, Scalar] = {
         "lvs_found_fraction": matches.accepted / matches.attempted if matches.attempted else nan,
         "lvs_correlation": float(np.median(matches.scores)) if len(matches) else nan,
@@ -102,24 +114,24 @@ def compare_with_map(
         templates = _match_templates(footprint)
         alignment = _align(templates.pixels, templates.map_pixels)
         errors_px = _errors_px(templates.pixels, templates.map_pixels, alignment)
-        results["template"] = (int(np.count_nonzero(errors_px <= TOLERANCE_PX)), len(errors_px))
+        results["template"] = _Matched(int(np.count_nonzero(errors_px <= TOLERANCE_PX)), len(errors_px))
         correlations = templates.correlations
         # from the largest contrast to the smallest
         order = np.argsort(-templates.interest, kind="stable")
         strong = correlations[order[: int(np.ceil(_STRONG_FRACTION * len(order)))]]
         for name, match in (("sift", _match_sift), ("orb", _match_orb)):
-            pixels, on_map, count = match(footprint)
-            errors_px = _errors_px(pixels, on_map, alignment)
+            features = match(footprint)
+            errors_px = _errors_px(features.pixels, features.map_pixels, alignment)
             correct = int(np.count_nonzero(errors_px <= TOLERANCE_PX))
-            results[name] = (correct, count)
+            results[name] = _Matched(correct, features.searched)
             row[f"{name}_inlier_fraction"] = correct / len(errors_px) if len(errors_px) else nan
     row["template_correlation"] = float(np.median(correlations)) if len(correlations) else nan
     row["template_strong_correlation"] = float(np.median(strong)) if len(strong) else nan
-    yields = np.array([correct / count if count else nan for correct, count in results.values()])
-    ranks = rankdata(-yields, method="min", nan_policy="omit")
-    for name, (correct, count), fraction, rank in zip(MATCHERS, results.values(), yields, ranks, strict=True):
-        row |= {f"{name}_searched": count, f"{name}_inliers": correct, f"{name}_yield": float(fraction)}
-        row[f"{name}_rank"] = float(rank)
+    yields = [result.correct / result.searched if result.searched else nan for result in results.values()]
+    ranks = rankdata(-np.array(yields), method="min", nan_policy="omit")
+    for (name, result), fraction, rank in zip(results.items(), yields, ranks, strict=True):
+        row |= {f"{name}_searched": result.searched, f"{name}_inliers": result.correct}
+        row |= {f"{name}_yield": fraction, f"{name}_rank": float(rank)}
     pixels = map_pixels(map_product, matches.points_m[:, :2])
     return MapComparison(corrected, matches, pixels, footprint, row)
 
@@ -152,7 +164,8 @@ def _resample(image: PosedImage, map_product: MapProduct, options: LvsOptions) -
     shape = (rows * _TILE_PX, columns * _TILE_PX)
     mosaic = values.reshape(rows, columns, _TILE_PX, _TILE_PX).swapaxes(1, 2).reshape(shape)
     valid = inside.reshape(rows, columns).repeat(_TILE_PX, axis=0).repeat(_TILE_PX, axis=1)
-    appearance = map_product.appearance[low[1] : low[1] + shape[0], low[0] : low[0] + shape[1]]
+    first_column, first_row = low
+    appearance = map_product.appearance[first_row:, first_column:][: shape[0], : shape[1]]
     return ImageFootprint(low, mosaic, appearance, valid)
 
 
@@ -192,7 +205,7 @@ def _align(pixels: Points2, map_pixels: Points2) -> Float[np.ndarray, "3 3"]:
     if len(pixels) < _MIN_INLIERS:
         return np.eye(3)
     homography, inliers = cv2.findHomography(
-        pixels, map_pixels, cv2.RANSAC, TOLERANCE_PX, maxIters=20000, confidence=0.9999
+        pixels, map_pixels, cv2.RANSAC, TOLERANCE_PX, maxIters=_RANSAC_ITERATIONS, confidence=_RANSAC_CONFIDENCE
     )
     return np.eye(3) if homography is None or inliers.sum() < _MIN_INLIERS else np.asarray(homography)
 
@@ -207,29 +220,41 @@ def _errors_px(pixels: Points2, map_pixels: Points2, alignment: Float[np.ndarray
 
 def _template_corners(valid: Bool[np.ndarray, "rows columns"]) -> Iterator[tuple[int, int]]:
     """Yield the corners (row, column) of the templates in the image whose search windows lie in the footprint."""
-    last = np.array(valid.shape) - _TEMPLATE_PX - _SEARCH_PX
-    for row in range(_SEARCH_PX, int(last[0]) + 1, _TEMPLATE_STEP_PX):
-        for column in range(_SEARCH_PX, int(last[1]) + 1, _TEMPLATE_STEP_PX):
+    rows, columns = (range(_SEARCH_PX, side - _TEMPLATE_PX - _SEARCH_PX + 1, _TEMPLATE_STEP_PX) for side in valid.shape)
+    for row in rows:
+        for column in columns:
             if valid[row : row + _TEMPLATE_PX, column : column + _TEMPLATE_PX].all():
                 yield row, column
 
 
-def _match_sift(footprint: ImageFootprint) -> tuple[Points2, Points2, int]:
-    """Match SIFT features; return their pixels in the image and on the map, and the number of the image's features."""
+@dataclass(frozen=True, eq=False)
+class _FeatureMatches:
+    """Matched features: pixels (column, row) of the footprint in the image and on the map.
+
+    - searched: number of the image's features
+    """
+
+    pixels: Points2
+    map_pixels: Points2
+    searched: int
+
+
+def _match_sift(footprint: ImageFootprint) -> _FeatureMatches:
+    """Match SIFT features of the image and of the map."""
     count = footprint.valid.size // _FEATURE_AREA_PX
     pixels, descriptors = extract_map_features(flatten(footprint.image), count, footprint.valid)
     map_points, map_descriptors = extract_map_features(flatten(footprint.appearance), count)
-    pairs = match_descriptors(descriptors, map_descriptors)
-    return pixels[pairs[0]], map_points[pairs[1]], len(pixels)
+    indices, map_indices = match_descriptors(descriptors, map_descriptors)
+    return _FeatureMatches(pixels[indices], map_points[map_indices], len(pixels))
 
 
-def _match_orb(footprint: ImageFootprint) -> tuple[Points2, Points2, int]:
-    """Match ORB features as `_match_sift`."""
+def _match_orb(footprint: ImageFootprint) -> _FeatureMatches:
+    """Match ORB features of the image and of the map."""
     options = orb.HomographyOptions(features=footprint.valid.size // _FEATURE_AREA_PX)
     pixels, descriptors = orb.detect_features(flatten(footprint.image), options)
     columns, rows = np.rint(pixels).astype(np.int64).T
     inside = footprint.valid[rows, columns]
     pixels, descriptors = pixels[inside], descriptors[inside]
     map_points, map_descriptors = orb.detect_features(flatten(footprint.appearance), options)
-    pairs = orb.match_features(descriptors, map_descriptors, options)
-    return pixels[pairs[:, 0]], map_points[pairs[:, 1]], len(pixels)
+    indices, map_indices = orb.match_features(descriptors, map_descriptors, options).T
+    return _FeatureMatches(pixels[indices], map_points[map_indices], len(pixels))

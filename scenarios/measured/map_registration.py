@@ -56,7 +56,15 @@ def create_map(
 ) -> MapProduct:
     """Create a map whose centre is the origin of the world; its maker states no errors."""
     centre = 0.5 * (np.array(appearance.shape[::-1]) - 1.0)
-    return MapProduct(appearance, elevation_m, -pixel_m * centre, pixel_m, 0.0, 0.0, 0.0)
+    return MapProduct(
+        appearance,
+        elevation_m,
+        origin_m=-pixel_m * centre,
+        pixel_m=pixel_m,
+        registration_sd_m=0.0,
+        distortion_sd_m=0.0,
+        elevation_sd_m=0.0,
+    )
 
 
 def add_map(source: Path, table: MapTable, cases: store.CasesFile) -> store.StoredCases:

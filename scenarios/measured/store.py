@@ -140,12 +140,14 @@ class CasesFile(UserFile):
     @classmethod
     def file_hash(cls, file: str) -> str:
         """Check `cases.json` and return its SHA-256."""
-        return _load(file)[1]
+        _, sha256 = _load(file)
+        return sha256
 
     @property
     def stored(self) -> StoredCases:
         """The contents of the file."""
-        return _load(self.file)[0]
+        stored, _ = _load(self.file)
+        return stored
 
 
 class MeasuredParameters(Parameters):

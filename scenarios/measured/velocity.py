@@ -19,26 +19,19 @@ from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.matching import (
+from marsyard.scenarios.measured.matching import case_row, distance
+from marsyard.scenarios.measured.pose_agreement import (
     agreement_products,
     agreement_row,
-    case_row,
     compare_with_poses,
-    distance,
     match_images,
 )
 from marsyard.scenarios.measured.store import MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
 from marsyard.scenarios.typed_scenario import TypedScenario
-from marsyard.scenarios.velocity import (
-    VELOCITY,
-    check_image_size,
-    check_last_interval,
-    consistency_row,
-    velocity_products,
-    velocity_row,
-)
+from marsyard.scenarios.velocity import VELOCITY, check_image_size, check_last_interval
+from marsyard.scenarios.velocity_score import consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.streams import Streams
@@ -89,6 +82,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
         }
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
+        _, inertial_m_s = measurements.interval_velocities_m_s[:, :2]  # of the second interval, as the estimate
 
         def run(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
             check = partial(check_last_interval, measurements=measurements)
@@ -105,7 +99,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
                 "velocity_estimated_x_m_s": float(estimate_m_s[0]),
                 "velocity_estimated_y_m_s": float(estimate_m_s[1]),
                 # estimated minus inertial velocity, which has an unknown constant error
-                "inertial_difference_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+                "inertial_difference_m_s": distance(velocity, inertial_m_s),
                 # estimated minus inertial velocity change between the intervals, in which this error cancels
                 "pair_discrepancy_m_s": np.nan if velocity_pair is None else velocity_pair.discrepancy_m_s,
                 **agreement_row(pairs),

@@ -1,7 +1,7 @@
-"""Import and construct user-defined parts of a scenario by name: motions, instruments and scores.
+"""Import and construct user-defined parts of a scenario by name, and check the columns that they report.
 
-The name of a part is ``module:name`` (the module may be in the current folder), or the name of an entry point of an
-installed package in the group of the part's kind.
+Parts are motions, instruments and scores. The name of a part is ``module:name`` (the module may be in the current
+folder), or the name of an entry point of an installed package in the group of the part's kind.
 """
 
 from __future__ import annotations

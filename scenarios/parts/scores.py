@@ -122,12 +122,20 @@ ScoredCase = ScoredVelocity | ScoredSite | ScoredRun
 SCORED: tuple[type[Any], ...] = (ScoredVelocity, ScoredFlight, ScoredDescent, ScoredSite, ScoredLanding, ScoredRun)
 
 
-def accepted_cases(score: Any) -> tuple[type[Any], ...]:
-    """Return the kinds of cases that a score's annotation accepts, with subclasses; all kinds without an annotation."""
+def annotated_cases(score: Any) -> tuple[type[Any], ...] | None:
+    """Return the kinds of cases that a score's annotation accepts, with subclasses; None without an annotation."""
     annotations = inspect.get_annotations(score if inspect.isroutine(score) else type(score).__call__)
     annotation_names = [str(kind) for name, kind in annotations.items() if name != "return"]
+    if not annotation_names:
+        return None
     classes = tuple(item for item in SCORED if any(item.__name__ in kind for kind in annotation_names))
-    return tuple(item for item in SCORED if issubclass(item, classes)) if annotation_names else SCORED
+    return tuple(item for item in SCORED if issubclass(item, classes))
+
+
+def accepted_cases(score: Any) -> tuple[type[Any], ...]:
+    """Return the kinds of cases that a score accepts: those of its annotation, all kinds without an annotation."""
+    kinds = annotated_cases(score)
+    return SCORED if kinds is None else kinds
 
 
 def load_score(spec: str, kind: type[Any] | None = None) -> Any:

@@ -17,6 +17,7 @@ from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
     goal_position,
+    is_at_goal,
     is_finished,
     plan_step,
 )
@@ -24,7 +25,7 @@ from marsyard.scenarios.rover.guides import Guide, TrackerGuide
 from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, oracle_heights
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
-from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, Setup, Step, StopView, is_stuck
+from marsyard.scenarios.rover.run_state import START_LEG, RoverRun, RunOutcome, Setup, Step, StopView, is_stuck
 from marsyard.sim.dynamics.driving import Drive
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import DriveCommand, StereoMeasurement
@@ -35,6 +36,9 @@ from marsyard.sim.streams import Streams
 SUBFRAME_RADIUS_FRACTION = 0.14
 #: Maximum turn in place between two stereo pairs of visual odometry, radians (MER: Maimone, Cheng & Matthies 2007).
 VISUAL_TURN_RAD = np.radians(18.0)
+#: Maximum distance from the goal at which the target is handed off to the arm, metres (assumed): the last step of an
+#: approach may overshoot the goal.
+HAND_OFF_TOLERANCE_M = 2.0 * GOAL_TOLERANCE_M
 #: Minimum and maximum depth of mapped points, metres, for the mast's cameras and the body cameras.
 MAST_RANGES_M, BODY_RANGES_M = (1.4, 8.0), (0.35, 3.0)
 #: Azimuth between successive stereo pairs of the mast in a navigation update, radians.
@@ -62,10 +66,10 @@ def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
         run.outcome = RunOutcome.LOST
     else:
         has_goal = not last_leg.ends_with_steps and last_leg.motion in ("approach", "back-off")
-        is_complete = not has_goal or is_finished(last_leg, 0, guide.target(run))
+        is_complete = not has_goal or is_at_goal(last_leg, guide.target(run))
         run.outcome = RunOutcome.COMPLETED if is_complete else RunOutcome.NOT_AT_GOAL
     if run.outcome is RunOutcome.COMPLETED and last_leg.motion == "approach":
-        goal = GoalCriterion(last_leg.goal_m, 2.0 * GOAL_TOLERANCE_M)
+        goal = GoalCriterion(last_leg.goal_m, HAND_OFF_TOLERANCE_M)
         result = hand_off(run.stops[-1].update, goal, run.setup.rig.calibrated)
         run.handed_off = result.outcome is HandOffOutcome.HANDED_OFF
     return run
@@ -73,7 +77,7 @@ def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
 
 def drive_legs(p: RoverScenarioParameters, run: RoverRun, guide: Guide) -> RunOutcome | None:
     """Drive all legs; return the outcome if the run ends early, else None."""
-    failure = visit_stop(p, run, guide, -1)
+    failure = visit_stop(p, run, guide, START_LEG)
     for number, leg in enumerate(p.legs):
         step_count = 0
         if leg.maps_first and failure is None:
@@ -178,21 +182,23 @@ def map_terrain(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, t
     vehicle, cameras, time_s = run.setup.vehicle, run.setup.navigation_cameras, run.time_s
     estimated_pose = vehicle.estimated_pose
     run.navigator.map_start(estimated_pose, vehicle.rover.enclosing_radius_m)
-    ahead = goal_position(leg, target)
-    azimuth = -float(np.arctan2(ahead[1], ahead[0]))
-    azimuths = [azimuth + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD for number in range(leg.wedges)]
+    world, rig, by_body = run.setup.world, run.setup.rig, leg.map_by == "body"
+    if by_body:
+        # the body cameras look straight ahead
+        ranges_m, azimuths = BODY_RANGES_M, [0.0]
+    else:
+        ahead = goal_position(leg, target)
+        azimuth = -float(np.arctan2(ahead[1], ahead[0]))
+        offsets = [number - 0.5 * (leg.wedges - 1) for number in range(leg.wedges)]
+        ranges_m, azimuths = MAST_RANGES_M, [azimuth + offset * MAST_SPACING_RAD for offset in offsets]
     if p.navigation.terrain == "oracle-heights":
-        ranges_m, azimuths = (BODY_RANGES_M, [0.0]) if leg.map_by == "body" else (MAST_RANGES_M, azimuths)
-        points = [
-            oracle_heights(run.setup.world, vehicle, azimuth, ranges_m, leg.map_by == "body") for azimuth in azimuths
-        ]
+        points = [oracle_heights(world, vehicle, azimuth, ranges_m, by_body) for azimuth in azimuths]
         estimated_from_true = estimated_pose * vehicle.stance.world_from_rover.inv()
         run.navigator.map_points(np.asarray(estimated_from_true.apply(np.concatenate(points))))
-    elif leg.map_by == "body":
-        run.navigator.map_pair(
-            cameras.take_body_pair(run.setup.world, run.setup.rig, vehicle, time_s), estimated_pose, BODY_RANGES_M
-        )
-    else:
-        for azimuth in azimuths:
-            pair = cameras.take_mast_pair(p, run.setup.world, run.setup.rig, vehicle, azimuth, time_s)
-            run.navigator.map_pair(pair, estimated_pose, MAST_RANGES_M)
+        return
+    for azimuth in azimuths:
+        if by_body:
+            pair = cameras.take_body_pair(world, rig, vehicle, time_s)
+        else:
+            pair = cameras.take_mast_pair(p, world, rig, vehicle, azimuth, time_s)
+        run.navigator.map_pair(pair, estimated_pose, ranges_m)

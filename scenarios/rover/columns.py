@@ -56,7 +56,7 @@ _TARGET = (
     instrument_error(
         "pose_error_fraction", "pose error, divided by the distance", "rover pose error / distance driven"
     ),
-    outcome("duration_min", "time from the first to the last stop, minutes"),
+    outcome("duration_min", "time from the start of the run to the last stop, minutes"),
     condition("sun_motion_deg", "angle between the sun's directions at the first and the last stop"),
     condition("min_exposure_s", "shortest exposure", "shortest exposure"),
     condition("max_exposure_s", "longest exposure", "longest exposure"),
@@ -159,7 +159,7 @@ COLUMNS = Columns(
 DRIVE_COLUMNS = Columns(
     (
         *_TARGET,
-        condition("step", "step between two updates: fraction of the distance, or degrees of a turn or circle"),
+        condition("step", "step between two updates: degrees of a turn, fixed length (m), or fraction of the distance"),
         flag("in_view", "the designated point stays visible", "whose point stays in view", ColumnKind.TRUTH),
         flag(
             "on_face",

@@ -14,9 +14,9 @@ from marsyard.scenarios.rover import points
 from marsyard.scenarios.rover.designation import is_on_edge
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Vector, rover_shades_patch, sample_template
+from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.run_state import RoverRun, StopView
 from marsyard.scenarios.rover.score import errors_px, finite_max
-from marsyard.scenarios.rover.vehicle import Rig
 from marsyard.scenarios.rover.world import RunWorld
 
 
@@ -74,7 +74,7 @@ def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Sca
         "incline": p.world.incline.name,
         "visual_odometry": any(leg.visual_odometry for leg in p.legs),
         "autonav": any(leg.autonav for leg in p.legs),
-        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
+        "map_by": next((leg.map_by for leg in p.legs if leg.uses_map), "none"),
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
@@ -93,7 +93,7 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
     is_moving = lengths > 0.0
     slips = np.array([drive.slip for drive in drives])[is_moving]
     distance = float(lengths.sum())
-    # range and time at the first and last stop, pose error at the last stop
+    # at the first and the last stop: range, and time since the start of the run; at the last stop: pose error
     ranges, times, pose_error = (np.nan, np.nan), (0.0, 0.0), np.nan
     if stops:
         ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
@@ -121,9 +121,9 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
 def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of the designated point's visibility at the stops of a run, and of the rover's shadow on it.
 
-    Stops count up to the first one with a lost or falsely tracked point: later poses follow from the tracker's error.
-
-    A run without stops has not lost sight of the point: it counts, as a failure, in the population of visible targets.
+    The shadow is evaluated up to the first stop with a lost or falsely tracked point: later poses of the rover follow
+    from the tracker's error. A run without stops has not lost sight of the point: it counts, as a failure, in the
+    population of visible targets.
     """
     if not run.stops:
         obliquity = {"obliquity_start_deg": np.nan, "obliquity_max_deg": np.nan}

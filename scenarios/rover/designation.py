@@ -11,7 +11,7 @@ from marsyard.algorithms.vtt.stereo import triangulate
 from marsyard.scenarios.rover import points
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Triangles, Vector
-from marsyard.scenarios.rover.vehicle import Rig
+from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.frames import SITE_FROM_WORLD
@@ -109,7 +109,7 @@ def is_on_edge(triangles: Triangles, foot_m: float, viewpoint: Vector, point: Ve
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_DIRECTIONS, endpoint=False)
     ring = axis + half_rad * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
     ring /= np.linalg.norm(ring, axis=1, keepdims=True)
-    # the ground around the rock is assumed level with its foot
+    # the ground around the rock is assumed level with its foot; lines of sight above the horizon end very far away
     descent_rates = np.maximum(-ring[:, 2], 1e-9)
     visible_range_m = np.minimum(
         points.ray_distances(triangles, viewpoint, ring), (viewpoint[2] - foot_m) / descent_rates

@@ -11,6 +11,11 @@ from marsyard.scenarios.timeline_surface import surface_from_above
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.render import Scene
 
+#: Margin of the shown ground around the run and the target, m.
+_MARGIN_M = 2.0
+#: Quantities of the updates that are no values over time.
+_NO_SERIES = ("leg", "time_s")
+
 
 def run_products(p: RoverScenarioParameters, run: RoverRun) -> dict[str, object]:
     """Collect the arrays for a run's figures (Figs. 15, 16b and 17 of the paper).
@@ -72,12 +77,6 @@ def run_products(p: RoverScenarioParameters, run: RoverRun) -> dict[str, object]
         "rocks_m": np.column_stack([rocks.position_m[rock_indices, :2], rocks.diameter_m[rock_indices]]),
     }
     return arrays
-
-
-#: Margin of the shown ground around the run and the target, m.
-_MARGIN_M = 2.0
-#: Quantities of the updates that are no values over time.
-_NO_SERIES = ("leg", "time_s")
 
 
 def run_timeline(p: RoverScenarioParameters, run: RoverRun) -> Timeline:
@@ -156,6 +155,6 @@ def _images(run: RoverRun, stop: Stop, template_px: float) -> list[TimedImage]:
                 upper_left = np.asarray(details.window_corner, dtype=np.float64) - corner - 0.5  # of a pixel's centre
                 boxes["search window"] = np.array([[*upper_left, *details.window.shape[::-1]]], dtype=np.float64)
         pose = CameraPose.from_camera(subframe, stop.world_from_head)
-        bits = run.setup.camera.detectors[0].parameters.bits
+        bits = run.setup.camera.bits
         images.append(TimedImage(f"{name} camera", stop.time_s, image.counts, bits, pose, marks, boxes))
     return images

@@ -26,7 +26,7 @@ TARGET_RADIUS_M = 1.0
 #: Points are mapped up to the height GROUND_STEP_M + GROUND_SLOPE * distance above or below the plane of the wheels.
 GROUND_STEP_M, GROUND_SLOPE = 0.3, 0.5
 #: Maximum x and maximum |y| of the rover's body and wheels in the rover frame, metres.
-BODY_M = (0.95, 1.2)
+BODY_FRONT_M, BODY_SIDE_M = 0.95, 1.2
 #: Margin around the rover within which the ground at the start is assumed to be a plane, metres.
 START_MARGIN_M = 0.3
 #: Parameters of the planner for maps from mast cameras and from body cameras (assumed). The disc swept by the rover is
@@ -67,15 +67,18 @@ def step_length_m(leg: LegParameters, target: TargetEstimate) -> float:
 
 def is_finished(leg: LegParameters, step_count: int, target: TargetEstimate) -> bool:
     """Return whether the leg is finished after this number of steps."""
-    if step_count >= leg.steps:
-        return True
+    return step_count >= leg.steps or is_at_goal(leg, target)
+
+
+def is_at_goal(leg: LegParameters, target: TargetEstimate) -> bool:
+    """Return whether an approach or back-off is at its final distance; False for the other motions, without a goal."""
     if leg.motion == "approach":
         return target.distance_m <= leg.goal_m + GOAL_TOLERANCE_M
     return leg.motion == "back-off" and target.distance_m >= leg.goal_m - GOAL_TOLERANCE_M
 
 
 def plan_step(leg: LegParameters, step_count: int, target: TargetEstimate) -> Iterator[DriveCommand]:
-    """Plan the commands of the next step; two commands if the rover turns in place before it drives."""
+    """Plan the commands of the next step: two if the rover turns in place before it drives, none if it stays."""
     if leg.motion == "turn":
         yield DriveCommand(turn_left_rad=-float(np.radians(leg.step_deg)))
         if leg.shuffle_m:
@@ -128,7 +131,7 @@ class Navigator:
         points = RectifiedPair.from_measurement(pair).points(*ranges_m)
         # steeper points, seen from the rover, are false matches; the body cameras also see the rover
         is_ground = np.abs(points[:, 2]) <= GROUND_STEP_M + GROUND_SLOPE * np.hypot(points[:, 0], points[:, 1])
-        is_ground &= (points[:, 0] > BODY_M[0]) | (np.abs(points[:, 1]) > BODY_M[1])
+        is_ground &= (points[:, 0] > BODY_FRONT_M) | (np.abs(points[:, 1]) > BODY_SIDE_M)
         if np.any(is_ground):
             self.map_points(np.asarray(world_from_rover.apply(points[is_ground])))
 

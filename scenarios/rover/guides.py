@@ -137,7 +137,7 @@ class DesignationGuide:
 
     @classmethod
     def designate(cls, run: RoverRun, margin_px: float, oracle: bool) -> DesignationGuide:
-        """Create the guide at the start; operators triangulate the point in images of the start.
+        """Create the guide at the start: operators triangulate the point in images of the start; an `oracle` knows it.
 
         Raises ValueError if the mast cannot point at the target or the point cannot be triangulated.
         """
@@ -145,7 +145,9 @@ class DesignationGuide:
             return cls(margin_px, None)
         stance, rig = run.setup.vehicle.stance, run.setup.rig
         point = run.target.point_world
-        angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(point.copy())), rig.calibrated, False)
+        angles = mast_angles(
+            np.asarray(stance.world_from_rover.inv().apply(point.copy())), rig.calibrated, use_both=False
+        )
         if angles is None:
             raise ValueError("the mast cannot point at the target's rock from the start of this drive")
         rig.point(*angles)

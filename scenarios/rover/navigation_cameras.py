@@ -1,6 +1,6 @@
 """Stereo images for visual odometry and the terrain map: navcams on the mast and hazcams on the body, binned.
 
-The rover's software bins images to 256 x 256 pixels. `oracle_heights` replaces the images of the map by the truth.
+The rover's software bins images to 256 x 256 pixels. `oracle_heights` replaces the map's images by the true ground.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.interface import PixelBox
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
+from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.stereo_camera import StereoCamera, cached_rays
-from marsyard.scenarios.rover.vehicle import Rig, Vehicle
+from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.scenarios.views import CAMERA_MOUNTINGS
 from marsyard.sim.camera import CameraModel
@@ -54,7 +55,7 @@ class _StereoPair:
 
     @classmethod
     def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _StereoPair:
-        """Draw the detectors of a pair with these true and calibrated cameras."""
+        """Draw the detectors of a pair; `name` is the cameras' preset, `head` has their true and calibrated models."""
         factor = 1.0 / p.navigation.binning
         binned_cameras = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
         detector, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
@@ -70,12 +71,13 @@ class _StereoPair:
         world: RunWorld,
         rig: Rig,
         vehicle: Vehicle,
-        mounts: tuple[RigidTransform, RigidTransform],
+        rover_from_mount: RigidTransform,
+        measured_rover_from_mount: RigidTransform,
         time_s: float,
         edge_rays: int,
     ) -> StereoMeasurement:
-        """Take a pair; `mounts` are the true and the measured pose of the mount's frame in the rover frame."""
-        world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
+        """Take a pair; the poses of the mount are the true and the measured one, rover frame."""
+        world_from_mount = compose(vehicle.stance.world_from_rover, rover_from_mount)
         rays = cached_rays(self.true[0])
         scene = world.navigation_scene(rays, world_from_mount, time_s).with_edge_rays(edge_rays)
         ahead = np.asarray(vehicle.stance.world_from_rover.apply(np.array([_SHADOW_AHEAD_M, 0.0, 0.0])))
@@ -89,7 +91,7 @@ class _StereoPair:
         images = self.camera.take(
             scene, shadow, world_from_mount, self.true, (boxes[0], boxes[1]), world.brightness(time_s), time_s
         )
-        left, right = (camera.transform(mounts[1]) for camera in self.calibrated)
+        left, right = (camera.transform(measured_rover_from_mount) for camera in self.calibrated)
         return StereoMeasurement(images.left.counts, images.right.counts, (left, right))
 
 
@@ -104,17 +106,16 @@ class NavigationCameras:
     @classmethod
     def draw(cls, p: RoverScenarioParameters, rig: Rig, streams: Streams) -> NavigationCameras:
         """Draw the calibration errors and detectors of the pairs that the legs use."""
-        uses_map = p.navigation.terrain == "stereo"
+        mapping_legs = p.legs if p.navigation.terrain == "stereo" else ()
+        mapped_by = {leg.map_by for leg in mapping_legs if leg.uses_map}
         uses_odometry = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
         mast = body = None
-        if uses_odometry or (
-            uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "mast" for leg in p.legs)
-        ):
+        if uses_odometry or "mast" in mapped_by:
             name, head = NAVCAMS[p.camera.preset], rig.head
             if name != p.camera.preset or p.camera.custom is not None:
                 head = StereoHead.draw(stereo_mast(name), p.stereo, streams.generator("navcam calibration"))
             mast = _StereoPair.draw(p, name, head, streams)
-        if uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
+        if "body" in mapped_by:
             left, right = preset(HAZCAM).cameras()
             # calibration errors of the body's cameras are sampled like those of a mast's cameras
             design = MastCalibration(rig.calibrated.geometry, left, right)
@@ -139,14 +140,13 @@ class NavigationCameras:
             raise ValueError("no leg of this run uses the mast's navigation cameras")
         rig.point(azimuth_rad, float(np.radians(p.navigation.elevation_deg)))
         measured = rig.calibrated.geometry.rover_from_head(*rig.state.readings_rad)
-        return self.mast.take(world, rig, vehicle, (rig.rover_from_head, measured), time_s, edge_rays)
+        return self.mast.take(world, rig, vehicle, rig.rover_from_head, measured, time_s, edge_rays)
 
     def take_body_pair(self, world: RunWorld, rig: Rig, vehicle: Vehicle, time_s: float) -> StereoMeasurement:
         """Take a pair with the body cameras. Raises ValueError without hazcams."""
         if self.body is None:
             raise ValueError("no leg of this run uses the body cameras")
-        mounts = self.rover_from_body, self.rover_from_body
-        return self.body.take(world, rig, vehicle, mounts, time_s, MAP_EDGE_RAYS)
+        return self.body.take(world, rig, vehicle, self.rover_from_body, self.rover_from_body, time_s, MAP_EDGE_RAYS)
 
 
 def oracle_heights(

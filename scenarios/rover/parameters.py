@@ -13,7 +13,7 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.terrain_files import site_validator
+from marsyard.scenarios.site_parameters import site_validator
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.driving import SlipParameters
 from marsyard.sim.error_sources import CLOUDS, DETECTOR, OPTICS, SHADOW, ErrorSource
@@ -170,9 +170,16 @@ class LegParameters(Parameters):
     def _check_step(self) -> LegParameters:
         if self.motion == "straight" and self.step_m is None:
             raise ValueError("a straight leg needs step_m")
+        if self.motion in ("approach", "back-off") and self.step_m is not None and self.step_m <= 0.0:
+            raise ValueError(f"step_m is {self.step_m:g}; allowed for motion '{self.motion}': above 0")
         if self.autonav and self.motion != "approach":
             raise ValueError(f"autonav needs a leg of motion 'approach', not '{self.motion}'")
         return self
+
+    @property
+    def uses_map(self) -> bool:
+        """Whether the navigator maps the terrain in this leg."""
+        return self.autonav or self.maps_first
 
 
 SUN_MOTION = ErrorSource("sun", "motion of the sun")

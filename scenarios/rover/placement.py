@@ -48,8 +48,8 @@ def sample_surface(run: RoverRun, viewpoint: Vector) -> Points3:
     rays = point - viewpoint + grid @ np.stack([right, up])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     triangles = run.setup.world.target_triangles
-    half_angle = float(np.arctan(np.sqrt(2.0) * _HALF_WIDTH_M / np.linalg.norm(point - viewpoint)))
-    nearby = triangles[spheres_near_line(enclosing_spheres(triangles), viewpoint, point, half_angle)]
+    half_diagonal_rad = float(np.arctan(np.sqrt(2.0) * _HALF_WIDTH_M / np.linalg.norm(point - viewpoint)))
+    nearby = triangles[spheres_near_line(enclosing_spheres(triangles), viewpoint, point, half_diagonal_rad)]
     distances = ray_distances(nearby, viewpoint, rays)
     is_hit = np.isfinite(distances)
     return np.asarray(viewpoint + distances[is_hit, None] * rays[is_hit])

@@ -48,7 +48,10 @@ def are_hidden(triangles: Triangles, points: Points, direction: Vector) -> Bool[
 
 
 def enclosing_spheres(triangles: Triangles) -> Float64[np.ndarray, "triangles 4"]:
-    """Return spheres that contain the triangles: centroid, and the longer of the two edges from the first corner."""
+    """Return spheres that contain the triangles: centre (three columns) and radius.
+
+    The centre is the centroid, the radius the longer of the two edges from the first corner.
+    """
     edges = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2)
     return np.column_stack([triangles.mean(axis=1), edges.max(axis=1)])
 
@@ -58,10 +61,10 @@ def spheres_near_line(
 ) -> Bool[np.ndarray, "spheres"]:
     """Select all spheres that rays within an angle of the line of sight can hit, and possibly some more."""
     axis = (point - viewpoint) / np.linalg.norm(point - viewpoint)
-    centres = spheres[:, :3] - viewpoint
+    centres, radii = spheres[:, :3] - viewpoint, spheres[:, 3]
     depths = centres @ axis
     offsets = np.linalg.norm(centres - depths[:, None] * axis, axis=1)
-    return np.asarray(offsets <= np.tan(half_angle_rad) * np.maximum(depths, 0.0) + spheres[:, 3])
+    return np.asarray(offsets <= np.tan(half_angle_rad) * np.maximum(depths, 0.0) + radii)
 
 
 def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Vector:
@@ -92,7 +95,7 @@ class RockOutline:
     triangles: Triangles
     viewpoint: Vector
     axes: Float64[np.ndarray, "3 3"]  #: rows: forward, right and up of the view, world axes
-    rows: Float64[np.ndarray, "rows 3"]  #: vertical tangent, from the foot up; left and right outline
+    rows: Float64[np.ndarray, "rows 3"]  #: columns: vertical tangent, from the foot up; tangents left and right
 
     @classmethod
     def from_triangles(cls, triangles: Triangles, viewpoint: Vector, ground_m: float) -> RockOutline:
@@ -100,8 +103,8 @@ class RockOutline:
         corners = triangles.reshape(-1, 3)
         corners = corners[corners[:, 2] > ground_m]
         axes = sight_axes(0.5 * (corners.min(axis=0) + corners.max(axis=0)) - viewpoint)
-        view = (corners - viewpoint) @ axes.T
-        across, up = view[:, 1] / view[:, 0], view[:, 2] / view[:, 0]
+        forward_m, right_m, up_m = ((corners - viewpoint) @ axes.T).T
+        across, up = right_m / forward_m, up_m / forward_m
         rows = []
         for low, high in pairwise(np.linspace(up.min(), up.max(), _OUTLINE_ROWS + 1)):
             row_tangents = across[(up >= low) & (up <= high)]

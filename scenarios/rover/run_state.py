@@ -17,14 +17,18 @@ from marsyard.scenarios.rover.designation import DesignatedTarget
 from marsyard.scenarios.rover.flight_software import Navigator, TargetEstimate
 from marsyard.scenarios.rover.navigation_cameras import NavigationCameras
 from marsyard.scenarios.rover.parameters import MobilityParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.stereo_camera import StereoCamera, StereoImages
-from marsyard.scenarios.rover.vehicle import Rig, Vehicle
+from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.driving import Drive
 from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements, StereoMeasurement
 from marsyard.sim.streams import Streams
+
+#: Index of the leg of the first stop, before the rover has driven.
+START_LEG = -1
 
 
 class RunOutcome(Enum):
@@ -46,7 +50,7 @@ class RunOutcome(Enum):
 class StopView:
     """The images of a stop, with the poses at which they were taken."""
 
-    leg: int  #: index of the leg (drive between two stops) that ended here; -1 for the start
+    leg: int  #: index of the leg with the step that ended here; `START_LEG` for the start
     time_s: float  #: time since the start of the run
     stance: Stance  #: true pose and joint angles of the rover
     estimated_pose: RigidTransform  #: estimated world pose of the rover

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64
 
+from marsyard.algorithms.vtt import VttDetails
 from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.scenarios.interface import Scalar
@@ -39,28 +40,36 @@ def update_quantities(run: RoverRun) -> dict[str, Float64[np.ndarray, "stops"]]:
             "leg": float(stop.leg),
             "time_s": stop.time_s,
         }
-        details = stop.details
-        if details is not None and details.change is not None:
-            row["magnification"] = details.change.magnification
-            row["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
-        if details is not None and details.stereo is not None:
-            row["stereo_score"] = details.stereo.score
-        if details is not None and not details.seeded and stop.update.tracked:
-            row["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
-        if details is not None and not details.seeded and details.match is not None:
-            row["match_score"] = details.match.score
-            if details.predicted_pixel is not None:
-                row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
-        rows.append(row)
+        rows.append(row if stop.details is None else row | _match_quantities(stop.details, stop.update.tracked))
     return {name: np.array([row.get(name, np.nan) for row in rows], dtype=np.float64) for name in UPDATE_QUANTITIES}
+
+
+def _match_quantities(details: VttDetails, tracked: bool) -> dict[str, float]:
+    """Return the quantities of an update's matches: template changes, scores, and correction of the prediction."""
+    row = {}
+    if details.change is not None:
+        row["magnification"] = details.change.magnification
+        row["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
+    if details.stereo is not None:
+        row["stereo_score"] = details.stereo.score
+    if details.seeded:  # the first update has no earlier template
+        return row
+    if tracked:
+        row["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
+    if details.match is not None:
+        row["match_score"] = details.match.score
+        if details.predicted_pixel is not None:
+            row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
+    return row
 
 
 def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
     """Compute the columns of the first updates (as in Table III), NaN for missing updates."""
+    quantities = update_quantities(run)
     return {
         f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else np.nan
         for number in range(count)
-        for name, values in update_quantities(run).items()
+        for name, values in quantities.items()
     }
 
 

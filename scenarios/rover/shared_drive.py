@@ -13,11 +13,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TrackingState
@@ -31,87 +30,16 @@ from marsyard.scenarios.rover.designation import designate_point
 from marsyard.scenarios.rover.guides import DesignationGuide, TrackerGuide
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, Setup, StopView
+from marsyard.scenarios.rover.shared_drive_parameters import PointParameters, SharedDriveParameters
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.tracked_run import run_tracker, score_track
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.terrain_scenario import TerrainScenario
-from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
 #: Cache sizes of a process: shared drives with their images, visibilities of targets along drives.
 MAX_DRIVES, MAX_VISIBILITIES = 1, 128
-
-
-class VariantParameters(Parameters):
-    """Rock, terrain and sun of one run; `SharedDriveParameters.run` is the index of a run."""
-
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
-    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 1.4
-    height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
-    shape: Annotated[int, Field(ge=0, le=31, description="number of the rock's shape, see PlacedRock")] = 0
-    yaw_deg: Annotated[float, Field(description="yaw of the rock, deg")] = 0.0
-    sun_azimuth_deg: Annotated[
-        float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")
-    ] = 225.0
-    sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun")] = 45.0
-
-
-class PointParameters(Parameters):
-    """A target on the rock's face, seen from the start of the drive, or from the middle of a circular drive."""
-
-    across: Annotated[float, Field(ge=-1.0, le=1.0, description="-1 at the rock's left edge, 1 at its right")] = 0.0
-    up: Annotated[float, Field(ge=0.0, le=1.0, description="0 at the rock's foot, 1 at its top")] = 0.5
-
-
-class StepRangeParameters(Parameters):
-    """A range of steps; requirements select cases by a boolean column with this name."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
-    min: float = 0.0
-    max: float = 1.0
-
-
-class SharedDriveParameters(Parameters):
-    """Drives whose images many cases use; each case has its own target and step.
-
-    `run`, `target`, `skipped_stops`, `drive.algorithm` and `drive.vtt` define a case.
-    """
-
-    drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
-    variants: Annotated[
-        tuple[VariantParameters, ...], Field(min_length=1, description="rock, terrain, sun of each run")
-    ]
-    targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
-    run: Annotated[int, Field(ge=0, description="index of the run")] = 0
-    target: Annotated[int, Field(ge=0, description="index of the target")] = 0
-    skipped_stops: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
-    margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the images")] = 110.0
-    steering: Annotated[
-        Literal["estimate", "oracle-target"],
-        Field(description="position that guides the drive: designated and propagated by odometry, or the true one"),
-    ] = "estimate"
-    step_ranges: Annotated[tuple[StepRangeParameters, ...], Field(description="ranges of steps")] = ()
-    max_obliquity_deg: float | None = Field(
-        default=None, gt=0.0, le=90.0, description="maximum obliquity of the face at a target for the column `on_face`"
-    )
-
-    @model_validator(mode="after")
-    def _check_numbers(self) -> SharedDriveParameters:
-        for name, index, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
-            if index >= count:
-                raise ValueError(f"{name} is {index}; allowed: 0 to {count - 1}")
-        if len(self.drive.legs) != 1:
-            raise ValueError(f"a shared drive must have one leg, not {len(self.drive.legs)}")
-        return self
-
-    @property
-    def step(self) -> float:
-        """Step between two updates: a fraction of the distance, or degrees of a turn or circle."""
-        leg = self.drive.legs[0]
-        if leg.motion in ("turn", "circle"):
-            return abs(leg.step_deg) * (self.skipped_stops + 1)
-        return float(1.0 - (1.0 - leg.step_fraction) ** (self.skipped_stops + 1))
 
 
 @dataclass(frozen=True)
@@ -255,7 +183,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         key, point, algorithm = DriveKey.from_parameters(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
         case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
-        visibility, shadow_columns = self._visibility(key, point, p.drive.vtt)
+        visibility, shadow = self._visibility(key, point, p.drive.vtt)
         shared = {
             **fixed_conditions(case, prepare_shared_run(p, drive)),
             "step": p.step,
@@ -263,7 +191,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "pure_ncc": algorithm == "pure-ncc",
             **{entry.name: bool(entry.min <= p.step <= entry.max) for entry in p.step_ranges},
             **asdict(visibility),
-            **shadow_columns,
+            **shadow,
             "on_face": visibility.in_view
             and (p.max_obliquity_deg is None or visibility.obliquity_max_deg <= p.max_obliquity_deg),
         }

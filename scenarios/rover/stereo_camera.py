@@ -1,4 +1,4 @@
-"""Stereo images of a mast's cameras: exposure of subframes."""
+"""Stereo images of a pair of cameras: rendering and exposure of their subframes."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from marsyard.sim.streams import Streams
 
 #: Factor by which the full frame is reduced for auto-exposure.
 _BINNING = 16
+#: Images without detector noise, of any detector: bits of the counts, and count of the given percentile of the left
+#: subframe (three quarters of full scale).
+_EXACT_BITS, _EXACT_PERCENTILE, _EXACT_COUNT = 12, 98.0, 3071.0
 #: Fall-off of a lens; cached because all runs of a process use the same camera designs.
 _cached_fall_off = lru_cache(maxsize=8)(natural_fall_off)
 #: Rays of a camera; cached because a navigation camera has the same rays in all images.
@@ -32,7 +35,7 @@ class StereoImages:
 
     left: MastImage
     right: MastImage
-    exposure_s: float
+    exposure_s: float  #: of both images; 0 without detector noise
 
     @cached_property
     def digest(self) -> bytes:
@@ -44,7 +47,8 @@ class StereoImages:
 class StereoCamera:
     """The detectors of a stereo pair with sampled pixel responses.
 
-    Without detector noise, counts are proportional to the light and rounded. The left subframe determines the exposure.
+    Without detector noise, counts are proportional to the light and rounded to 12 bits. The left subframe sets the
+    exposure.
     """
 
     parameters: RoverScenarioParameters
@@ -54,15 +58,17 @@ class StereoCamera:
     @classmethod
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> StereoCamera:
         """Draw the detectors of both cameras; their fall-off is that of the nominal lens design."""
-        design, parameters, rng = (
-            p.camera.mast(),
-            p.camera.detector_parameters(),
-            streams.generator("detector response"),
-        )
+        design, parameters = p.camera.mast(), p.camera.detector_parameters()
+        rng = streams.generator("detector response")
         left, right = (
             Detector.draw(_cached_fall_off(camera), parameters, rng) for camera in (design.left, design.right)
         )
         return cls(p, (left, right), streams.generator("detector noise"))
+
+    @property
+    def bits(self) -> int:
+        """Number of bits of a count."""
+        return self.detectors[0].parameters.bits if self.parameters.camera.detector_noise else _EXACT_BITS
 
     def take(
         self,
@@ -100,7 +106,7 @@ class StereoCamera:
             detector, metering_radiance = windows[0], radiances[0]
             exposure_s = detector.parameters.exposure_s
             if p.exposure.metering == "full-frame":
-                # reduced full frame, and a detector of its size
+                # reduced full frame, and a detector of its size, whose response repeats if the subframe is smaller
                 reduced_rays = PixelRays.from_camera(cameras[0].scale(1.0 / _BINNING))
                 metering_radiance = render(add_rover(scene).with_edge_rays(1), reduced_rays)
                 rows, columns = metering_radiance.shape
@@ -114,8 +120,9 @@ class StereoCamera:
                 for window, radiance in zip(windows, radiances, strict=True)
             ]
         else:
-            # 12-bit counts: the 98th percentile of the left subframe is 3071, three quarters of full scale
-            gain = 3071.0 / max(float(np.percentile(radiances[0], 98.0)), 1e-9)
-            counts = [np.clip(np.rint(gain * radiance), 0, 4095).astype(np.uint16) for radiance in radiances]
+            brightness_at_count = float(np.percentile(radiances[0], _EXACT_PERCENTILE))
+            gain = _EXACT_COUNT / max(brightness_at_count, 1e-9)  # finite also without light
+            full_scale = 2**_EXACT_BITS - 1
+            counts = [np.clip(np.rint(gain * radiance), 0, full_scale).astype(np.uint16) for radiance in radiances]
         left, right = (MastImage(values, box.corner) for values, box in zip(counts, boxes, strict=True))
         return StereoImages(left, right, exposure_s)

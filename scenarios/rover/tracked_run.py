@@ -45,7 +45,7 @@ def run_tracker(
         return ScoredTrack(run, {**score.score_run(p, run), **score.tracking_row(run), **times})
 
     algorithm_run = run_algorithm(track_and_score, lambda answer: cast(ScoredTrack, answer))
-    # the time includes that of the images, which follow from the answers
+    # without the measured time: it includes that of the images, which follow from the answers
     return algorithm_run if algorithm_run.answer is None else replace(algorithm_run, row={})
 
 

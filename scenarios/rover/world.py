@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
-from marsyard.scenarios.views import SiteGround, Viewpoint, load_ground, select_rocks, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, load_ground, site_scene
+from marsyard.scenarios.visible_rocks import select_rocks
 from marsyard.sim.dynamics.driven_ground import RockyGround
 from marsyard.sim.render import CloudLayer, PixelRays, Scene
 from marsyard.sim.streams import Streams
@@ -67,6 +68,7 @@ class RunWorld:
     sun: MovingSunParameters
     target_number: int  #: index of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
+    #: index of an interval of the sun's position, and the scene in it
     _cached_scene: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
@@ -129,7 +131,7 @@ class RunWorld:
         viewpoint = Viewpoint.from_pose(rays, world_from_camera, self.ground.surface)
         viewpoint = replace(viewpoint, max_distance_m=min(viewpoint.max_distance_m, NAVIGATION_ROCKS_M))
         return self.scene(time_s).with_viewpoint(
-            select_rocks(self.ground, viewpoint),
+            select_rocks(self.ground.rocks, self.ground.site.photometry.rock_albedo, viewpoint),
             (viewpoint.east_m, viewpoint.north_m),
             MESH_FINEST_M,
             NAVIGATION_HALF_WIDTH_M,
@@ -142,7 +144,8 @@ class RunWorld:
         centre = (self.viewpoint.east_m, self.viewpoint.north_m)
         half_side_m = self.start_distance_m + ROUTE_MARGIN_M
         max_distance_m = float(np.sqrt(2.0)) * half_side_m
-        rocks = select_rocks(self.ground, replace(self.viewpoint, half_width_rad=np.pi, max_distance_m=max_distance_m))
+        viewpoint = replace(self.viewpoint, half_width_rad=np.pi, max_distance_m=max_distance_m)
+        rocks = select_rocks(self.ground.rocks, self.ground.site.photometry.rock_albedo, viewpoint)
         return RockyGround.from_triangles(self.ground.surface, rocks.triangles, centre, half_side_m)
 
     def brightness(self, time_s: float) -> float:

@@ -20,11 +20,12 @@ from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ProgramDetails,
     parse_command,
+    process,
     read_case,
     write_case,
 )
 from marsyard.algorithms.exchange.process import RunningProgram
-from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.exchange.serving import Command, acquire_server, end_idle_programs, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
@@ -355,3 +356,61 @@ def test_program_that_does_not_read_a_long_request_times_out() -> None:
     with pytest.raises(AlgorithmError) as error:
         program.read_line("x" * 1_000_000)
     assert error.value.fault is Fault.TIMED_OUT
+
+
+def test_time_limit_of_a_case_also_limits_a_single_answer() -> None:
+    limits = ExecutableLimits(time_s=60.0, total_s=0.3)
+    program = RunningProgram((sys.executable, "-c", "import time; time.sleep(60)"), limits)
+    with pytest.raises(AlgorithmError, match=r"no answers to the case within 0\.3 s") as error:
+        program.read_all()
+    assert error.value.fault is Fault.TIMED_OUT
+
+
+def test_endless_standard_error_exceeds_the_output_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = RunningProgram((sys.executable, "-c", "print(1); input()"), ExecutableLimits())
+    with monkeypatch.context() as patch:
+        # a program that writes faster than its output is read
+        patch.setattr(process, "_read_pending", lambda _: b"x" * 100_000)
+        with pytest.raises(AlgorithmError, match="it wrote more than 1 MB") as error:
+            program.read_line()
+    assert error.value.fault is Fault.TOO_MUCH_OUTPUT
+    assert not program.is_running()
+
+
+#: A program that answers one request and ends.
+ONE_ANSWER = """
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
+request = json.loads(input())
+print(json.dumps({"exchange": 3, "id": request["id"], "outcome": None}), flush=True)
+"""
+
+
+def test_folder_of_a_program_that_ended_while_idle_is_removed(tmp_path: Path) -> None:
+    command, limits = Command(tuple(write_program(tmp_path, ONE_ANSWER).split()), True), ExecutableLimits()
+    ended = acquire_server(command, limits)
+    ended.send_request({"do": "start"})
+    release_server(command, limits, ended)
+    while ended.child.is_running():
+        time.sleep(0.01)
+    server = acquire_server(command, limits)
+    assert server is not ended
+    assert not ended.child.folder.exists()
+    server.child.stop()
+
+
+#: A program that ends with status 3 at the request `estimate`.
+ENDING_PROGRAM = """
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
+input()
+sys.exit(3)
+"""
+
+
+def test_session_reports_that_its_program_has_ended(measurements: DescentMeasurements, tmp_path: Path) -> None:
+    command = parse_command(f"serve:{write_program(tmp_path, ENDING_PROGRAM)}")
+    assert command is not None
+    estimator = ExecutableAlgorithm(command, ExecutableLimits(), VELOCITY_REQUESTS)
+    for message in ("it ended with status 3", "its process ended after an earlier fault"):
+        with pytest.raises(AlgorithmError, match=message) as error:
+            estimator.estimate(measurements)
+        assert error.value.fault is Fault.CRASHED

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableTargetTracker,
@@ -21,7 +22,7 @@ from marsyard.algorithms.exchange.files import write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.interface import TargetLoss, TargetTracker, TrackingState
+from marsyard.algorithms.interface import MastAim, PixelBox, TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 from marsyard.scenarios.conformance import trackers
 from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
@@ -207,3 +208,40 @@ def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
 def test_all_three_target_designations_round_trip(target: TargetDesignation) -> None:
     assert encode(read_target(encode(target))) == encode(target)
     assert type(read_target(encode(target))) is type(target)
+
+
+class _Unchecked:
+    """Fields of a data class whose types are not checked at creation, as without the run-time checks of the tests."""
+
+    def __init__(self, **fields: object) -> None:
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+
+class _UncheckedUpdate(_Unchecked, TargetUpdate):
+    pass
+
+
+class _UncheckedBox(_Unchecked, PixelBox):
+    pass
+
+
+class _UncheckedAim(_Unchecked, MastAim):
+    pass
+
+
+@pytest.mark.parametrize("losses", [TargetLoss.OUT_OF_VIEW, ("OUT_OF_VIEW",), None])
+def test_losses_of_another_type_are_refused(losses: object) -> None:
+    update = _UncheckedUpdate(state=TrackingState.LOST, losses=losses, position_rover=None, details=None)
+    with pytest.raises(AlgorithmError, match=r"losses is .*; allowed: a tuple of members of TargetLoss") as error:
+        check_update(update)
+    assert error.value.fault is Fault.BAD_ANSWER
+
+
+@pytest.mark.parametrize("corner", [(0, 0, 0), (0,), None, (0.0, 0.0)])
+def test_region_with_another_number_of_coordinates_is_refused(corner: object) -> None:
+    box, right = _UncheckedBox(corner=corner, size=(64, 64)), PixelBox((0, 0), (64, 64))
+    aim = _UncheckedAim(azimuth_rad=0.0, elevation_rad=0.0, left=box, right=right)
+    with pytest.raises(AlgorithmError, match=r"left has corner .*; allowed: whole pixels inside the frame") as error:
+        check_aim(aim, trackers.mast())
+    assert error.value.fault is Fault.BAD_ANSWER

@@ -103,6 +103,12 @@ def test_patches_are_scaled_and_rolled_about_the_point(magnification: float, rol
     np.testing.assert_allclose(patch, render_blobs(4, centre + offsets @ rotation.T), atol=2e-3 * image.std())
 
 
+@pytest.mark.parametrize("centre", [(-0.5, 40.0), (40.0, 79.5), (-90.0, 40.0), (np.nan, 40.0)])
+def test_patch_needs_a_centre_inside_the_image(centre: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match=r"the centre of a patch, .* is outside the image"):
+        similarity_patch(render_blobs(4, pixel_grid(80)), np.array(centre), 21)
+
+
 def test_registration_recovers_subpixel_shifts() -> None:
     image = render_blobs(6, pixel_grid(80))
     for centre in np.random.default_rng(1).uniform(35.0, 45.0, (10, 2)):

@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.navigation import visual_odometry
 from marsyard.algorithms.navigation.planner import NavigationOptions, NavigationOutcome, NavigationPlan, navigate
 from marsyard.algorithms.navigation.stereo import RectifiedPair
 from marsyard.algorithms.navigation.terrain_map import CELL_M, GroundLimits, TerrainMap
@@ -335,6 +336,14 @@ def test_slip_is_measured() -> None:
 def test_ground_without_texture_is_an_expected_failure() -> None:
     result = estimate_motion(_render_pair(START, 0.0), _render_pair(MOTION, 0.0), _make_prediction())
     assert result.outcome in (VisualOdometryOutcome.TOO_FEW_FEATURES, VisualOdometryOutcome.TOO_FEW_INLIERS)
+    assert result.first_from_second is None
+
+
+def test_motion_with_too_few_inliers_after_the_last_adjustment_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visual_odometry, "_ADJUSTMENTS", 1)
+    monkeypatch.setattr(visual_odometry, "_MAX_NORMALISED_DISTANCE", 1e-6)
+    result = estimate_motion(_render_pair(START), _render_pair(MOTION), _make_prediction())
+    assert (result.outcome, result.inliers) == (VisualOdometryOutcome.TOO_FEW_INLIERS, 0)
     assert result.first_from_second is None
 
 

@@ -112,3 +112,12 @@ def test_settings_that_the_sandbox_cannot_enforce_are_refused(
     monkeypatch.setattr(limits, "find_problem", lambda: "")
     with pytest.raises(ValidationError, match=message):
         ExecutableLimits.model_validate({"sandbox": True, **values})
+
+
+@pytest.mark.parametrize("word", ["", "x" * 300])
+def test_words_that_name_no_file_make_nothing_visible(word: str, tmp_path: Path) -> None:
+    """An empty word is not the working folder; a word can be longer than any name of a file."""
+    folder = Path("/folder")
+    words, without = (sandbox.sandbox_words(w, {}, folder, tmp_path, []) for w in (["true", word], ["true"]))
+    assert words[:-1] == without
+    assert words[-1] == word

@@ -12,7 +12,8 @@ from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.tasks import Task
-from marsyard.scenarios.velocity import VELOCITY, velocity_row
+from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity_score import velocity_row
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 

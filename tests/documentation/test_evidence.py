@@ -74,7 +74,7 @@ def test_explorations_do_not_use_the_seed_of_a_calibration() -> None:
 
 def test_span_of_inertial_data_is_that_of_the_code() -> None:
     text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
-    assert re.findall(r"inertial data begin ([\d.]+) s before", text) == [f"{simulation.LEAD_S:g}"]
+    assert re.findall(r"inertial data begin ([\d.]+) s before", text) == [f"{simulation.INERTIAL_LEAD_S:g}"]
     assert re.findall(r"flight is simulated from ([\d.]+) s before", text) == [f"{FLIGHT_LEAD_S:g}"]
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import marsyard
@@ -53,6 +54,20 @@ def test_changes_accept_python_values() -> None:
     assert parameters["site"] == "meridiani"
     assert "location.east_m" not in campaign.definition.dispersions
     assert len(marsyard.draws(campaign, 3)) == 3
+
+
+def test_changes_accept_numbers_and_arrays_of_numpy() -> None:
+    changes = {
+        "terrain.rms_slope_deg": np.linspace(1.0, 2.0, 3)[1],
+        "location.east_m": np.float32(3.5),
+        "terrain.samples": np.int64(1024),
+        "exact_instruments": np.bool_(True),
+        "dimes.binned_size": np.array([128, 64]),
+    }
+    parameters = marsyard.load_campaign("dimes-smoke", changes).definition.parameters
+    assert (parameters["terrain"]["rms_slope_deg"], parameters["location"]["east_m"]) == (1.5, 3.5)
+    assert (parameters["terrain"]["samples"], parameters["exact_instruments"]) == (1024, True)
+    assert list(parameters["dimes"]["binned_size"]) == [128, 64]
 
 
 def test_metric_of_a_case_without_the_column_is_missing() -> None:

@@ -118,6 +118,10 @@ def test_dry_run_only_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert re.search(r"^  0\.\d+ s per case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", result.out, re.MULTILINE)
     assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ MB of products$", result.out, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
+    result = marsyard("run", tmp_path / "fake.toml", "--dry-run", "-n", 3, "--cluster", "local:7")
+    assert "3 cases on 7 workers" in result.text
+    result = marsyard("run", tmp_path / "fake.toml", "--dry-run", "-n", 3, "--cluster", "tcp://host:8786")
+    assert "the cluster is assumed to have one worker per core" in result.text
 
 
 def _crashing_case_setting(case: int) -> str:
@@ -202,6 +206,25 @@ def test_invalid_arguments_are_rejected(finished_run: Path, tmp_path: Path, argu
     assert (result.status, result.out, "Traceback" in result.err) == (2, "", False)
     assert " ".join(message.split()) in result.text
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("resume", ("--retry", "all")),
+        ("resume", ("--case-time", "5")),
+        ("resume", ("--allow-changed",)),
+        ("append", ("2", "--allow-changed")),
+    ],
+)
+def test_options_of_campaigns_are_rejected_for_studies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, options: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr("marsyard.cli.studies.contains_study", lambda directory: directory == tmp_path)
+    result = marsyard(command, tmp_path, *options)
+    assert result.status == 2
+    name = next(option for option in options if option.startswith("--"))
+    assert f"{name}: not for studies; {tmp_path} contains a study" in result.text
 
 
 def test_internal_error_has_status_2(monkeypatch: pytest.MonkeyPatch) -> None:

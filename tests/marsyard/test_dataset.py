@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.dataset import _prepare_terrains
+from marsyard.dataset import MANIFEST, _prepare_terrains
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.camera import read_cahvor
@@ -49,6 +49,14 @@ def run_dataset(folder: Path, *arguments: str) -> tuple[int, str]:
 def read_shard(path: Path) -> dict[str, bytes]:
     with tarfile.open(path) as shard:
         return {member.name: shard.extractfile(member).read() for member in shard.getmembers()}
+
+
+def test_folder_with_another_file_of_the_manifests_name_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / MANIFEST).write_text("[]")
+    status, output = run_dataset(tmp_path)
+    assert status == 2
+    assert "is not the manifest of a data set" in output
 
 
 def test_only_terrains_of_several_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

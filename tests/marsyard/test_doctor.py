@@ -18,6 +18,7 @@ from rich.console import Console
 
 from marsyard import doctor, gl_probe
 from marsyard.doctor import CheckResult, DoctorCheck, Probe
+from marsyard.sim.render import backend
 
 #: Results of a rendering test with an OpenGL backend that works, and with one that is not installed.
 WORKING_BACKEND = Probe(
@@ -96,6 +97,27 @@ def test_verdict_follows_the_selected_backend(
     *_, selection = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
     assert selection.verdict is verdict
     assert remedy in selection.remedy
+
+
+@pytest.mark.parametrize("installed", [("OSMesa", "EGL"), ("OSMesa",), ("EGL",), ()])
+@pytest.mark.parametrize("variable", ["", None])
+def test_without_variable_the_first_installed_backend_is_checked(
+    monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], variable: str | None
+) -> None:
+    """The doctor checks the backend that campaigns use; a machine with EGL only needs no variable."""
+    monkeypatch.delenv("MARSYARD_GL")
+    if variable is not None:
+        monkeypatch.setenv("MARSYARD_GL", variable)
+    for module in (doctor, backend):
+        monkeypatch.setattr(module, "find_library", lambda name: name if name in installed else None)
+    probes = {
+        name: WORKING_BACKEND if library in installed else ABSENT_BACKEND for name, library in doctor.LIBRARIES.items()
+    }
+    *_, selection = doctor.check_rendering(probes)
+    if installed:
+        assert (selection.verdict, selection.finding) == (CheckResult.OK, backend.default_backend())
+    else:
+        assert selection.verdict is CheckResult.FAIL
 
 
 def test_backend_with_wrong_depth_fails() -> None:

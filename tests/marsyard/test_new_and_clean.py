@@ -16,6 +16,7 @@ from marsyard.cli.estimate import evidence_limits
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.verdicts import Status
+from marsyard.scenarios.template import toml_environment
 from tests.command import run_command
 
 #: Fields of EuRoC's sensor.yaml for the first camera.
@@ -28,6 +29,12 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 
 
 TERRAIN = 'dispersions."location.terrain"'
+
+
+@pytest.mark.parametrize("text", ["cam 1.cahvor", "caméra.txt", "\U0001f680.csv", 'a "b" \\ c', "del \x7f"])
+def test_texts_of_new_campaigns_are_valid_toml(text: str) -> None:
+    template = toml_environment().from_string("file = {{ file | toml }}")
+    assert tomllib.loads(template.render(file=text)) == {"file": text}
 
 
 @pytest.fixture
@@ -129,6 +136,8 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
         (("--system", "velocty"), "unknown system 'velocty' (did you mean 'velocity'?); allowed: landing, tracking"),
         (("--system", "velocity", "--camera", "absent.yaml"), "absent.yaml: file: cannot be read"),
         (("--system", "tracking", "--camera", "cam.yaml"), "see camera.preset"),
+        (("--system", "velocity", "--bound", "nan"), "--bound nan: allowed: a finite number"),
+        (("--system", "landing", "--bound", "inf"), "--bound inf: allowed: a finite number"),
         (("--system", "landing", "--flight", "flight.csv"), "only descents accept"),
     ],
 )

@@ -1,7 +1,9 @@
 """Tests of the Python interface: algorithms given as objects, campaigns without files, and results."""
 
+import inspect
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -123,14 +125,38 @@ def test_captured_values_identify_functions_and_classes(tmp_path: Path) -> None:
     assert first == equal != other
 
 
-def test_global_variables_identify_a_function_of_a_notebook(tmp_path: Path) -> None:
-    source, cell, specs = "def estimate(measurements):\n    return gain\n", tmp_path / "cell.py", []
-    cell.write_text(source)
+@pytest.mark.parametrize(
+    "source",
+    [
+        "def Algorithm(measurements):\n    return gain\n",
+        "def Algorithm(measurements):\n    return [gain for _ in range(3)]\n",
+        "class Algorithm:\n    @staticmethod\n    def estimate(measurements):\n        return gain\n",
+        "class Algorithm:\n    @property\n    def gain(self):\n        return gain\n",
+        "class Algorithm:\n    gain = gain\n",
+        "class Base:\n    def estimate(self, measurements):\n        return gain\nclass Algorithm(Base):\n    pass\n",
+    ],
+)
+def test_global_variables_identify_code_of_a_notebook(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the source of a class is found through its module
+    monkeypatch.setattr(inspect, "getsource", lambda _: source)
+    specs = []
     for gain in (1.0, 1.0, 2.0):
         namespace: dict[str, Any] = {"__name__": "__main__", "gain": gain}
-        exec(compile(source, cell, "exec"), namespace)  # noqa: S102  (as a notebook does)
-        specs.append(store_object(namespace["estimate"], tmp_path))
+        exec(source, namespace)  # noqa: S102  (as a notebook does)
+        specs.append(store_object(namespace["Algorithm"], tmp_path))
     assert specs[0] == specs[1] != specs[2]
+
+
+@dataclass(frozen=True, slots=True)
+class _Slotted:
+    gain: float
+
+
+def test_state_in_slots_identifies_an_instance(tmp_path: Path) -> None:
+    first, equal, other = (store_object(_Slotted(gain), tmp_path) for gain in (1.0, 1.0, 2.0))
+    assert first == equal != other
 
 
 def test_objects_that_cannot_be_stored_are_reported(tmp_path: Path) -> None:
@@ -205,6 +231,8 @@ def test_cases_and_figures_are_shown(result: Result) -> None:
     assert case.summary.statuses[0].word == "violated"
     for name in ("errors", "histogram", "distribution"):
         assert isinstance(result.figure(name), Figure)
+    # the requirement on this boolean column has no bound
+    assert not [text.get_text() for text in result.figure("histogram", "answered").axes[0].texts]
     assert "violated" in case._repr_html_()
     assert "DIMES-VEL" in result._repr_html_()
     for call, message in (

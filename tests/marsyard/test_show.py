@@ -92,6 +92,14 @@ def test_units_and_descriptions_come_from_the_scenario() -> None:
     assert all(dispersion["description"] for dispersion in output["dispersions"])
 
 
+def test_campaign_with_a_nominal_case_only_has_no_draws(tmp_path: Path) -> None:
+    path = tmp_path / "nominal.toml"
+    path.write_text(CAMPAIGN.partition("[dispersions]")[0].replace("latin-hypercube", "random"))
+    result = marsyard("show", path, "--draw", 2)
+    assert result.status == 0, result.text
+    assert "Draws of 0 cases" in result.text
+
+
 def test_draws_are_shown_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
     figure = tmp_path / "draws.svg"
     result = marsyard("show", campaign, "--draw", 25, "--figure", figure)

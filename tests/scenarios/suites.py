@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, run_check
+from marsyard.scenarios.conformance.candidates import Subject, determine_task, list_checks, run_check
 from marsyard.scenarios.conformance.checks import Finding
 
 
 def run_suite(spec: str, *checks: str, task: str | None = None, limit_s: float = 60.0) -> dict[str, Finding]:
     """Run the given checks, or all checks, of an algorithm or part; return the findings by name of the check."""
-    subject = CandidateAlgorithm(spec, task or determine_task(spec), limit_s)
-    names = [name for name, _ in check_names(subject)]
+    subject = Subject(spec, task or determine_task(spec), limit_s)
+    names = [name for name, _ in list_checks(subject)]
     return {name: run_check(subject, names.index(name)) for name in (checks or names)}
 
 

@@ -11,7 +11,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
-from marsyard.scenarios.rover.shared_drive import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.shared_drive import SharedDriveScenario
+from marsyard.scenarios.rover.shared_drive_parameters import SharedDriveParameters
 from marsyard.scenarios.systems import catalogue, systems
 from marsyard.sim.streams import Streams
 

@@ -8,7 +8,7 @@ import pytest
 
 from marsyard.campaigns.running.conformance import run_conformance_checks
 from marsyard.scenarios.conformance import inputs, trackers
-from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, determine_task
+from marsyard.scenarios.conformance.candidates import Subject, determine_task
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
@@ -211,7 +211,7 @@ def test_changed_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyP
     """Each check runs in its own process; the suite compares the state of the process before and after."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     spec = write_defective_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NO_ANSWER"))
-    first_check = next(iter(run_conformance_checks(CandidateAlgorithm(spec, "velocity", 60.0))))
+    first_check = next(iter(run_conformance_checks(Subject(spec, "velocity", 60.0))))
     assert (first_check.check, first_check.passed) == ("answer", False)
     assert problem in first_check.problem
     assert first_check.next_step

@@ -29,7 +29,8 @@ from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.tasks import Task
-from marsyard.scenarios.velocity import VELOCITY, consistency_row
+from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity_score import consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
 

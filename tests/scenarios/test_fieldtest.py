@@ -16,11 +16,12 @@ from marsyard.scenarios import fieldtest
 from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.fieldtest import run as run_module
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
-from marsyard.scenarios.fieldtest.flight import RunKey, field_camera, sun_direction
+from marsyard.scenarios.fieldtest.flight import RunKey, field_camera
 from marsyard.scenarios.fieldtest.images import build_start_scene, run_ground, scene_at, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, ImageTargetParameters
 from marsyard.scenarios.fieldtest.run import FieldRun, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
+from marsyard.scenarios.fieldtest.sun_position import sun_direction
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
 from marsyard.scenarios.fieldtest.triples import Category, case_order, find_triples
 from marsyard.scenarios.parts import ScoredFlight

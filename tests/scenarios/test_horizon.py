@@ -7,8 +7,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from marsyard.scenarios.horizon import add_unresolved_rocks, horizon_relief
+from marsyard.scenarios.horizon import horizon_relief
 from marsyard.scenarios.views import SiteGround
+from marsyard.scenarios.visible_rocks import add_unresolved_rocks
 from marsyard.sim.render import Frame, Scene, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.objects import FIRST_MESH_NUMBER

@@ -7,20 +7,17 @@ import pytest
 
 from marsyard.scenarios.views import (
     CAMERA_MOUNTINGS,
-    DETAIL_TRIANGLES,
-    ROCK_TRIANGLES,
-    SMALLEST_ROCK_PX,
     SiteGround,
     Viewpoint,
     camera_pose,
     mast_pose,
     nadir_pose,
-    select_rocks,
     site_scene,
 )
+from marsyard.scenarios.visible_rocks import DETAIL_TRIANGLES, ROCK_TRIANGLES, SMALLEST_ROCK_PX, select_rocks
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
-from marsyard.sim.render import PixelRays, Sun, process_renderer
+from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.sensor import PRESETS, preset
 from marsyard.sim.terrain import Site, site
@@ -32,6 +29,10 @@ def _make_small_site(name: str, samples: int = 512) -> Site:
     """Return a preset site with fewer terrain samples, which is built quickly."""
     preset_site = site(name)
     return preset_site.model_copy(update={"ground": preset_site.ground.model_copy(update={"samples": samples})})
+
+
+def _select_rocks(ground: SiteGround, viewpoint: Viewpoint) -> Objects:
+    return select_rocks(ground.rocks, ground.site.photometry.rock_albedo, viewpoint)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,7 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     field = ground.rocks
     # The radius is less than half a terrain period, so that no rock occurs twice.
     viewpoint = Viewpoint(2.0, 3.0, 1.5, pixel_rad=5e-3, max_distance_m=12.0)
-    objects = select_rocks(ground, viewpoint)
+    objects = _select_rocks(ground, viewpoint)
     assert len(objects) > 100
     # Each body is at the horizontal position of its rock plus a multiple of the period.
     offsets_m = objects.spheres[:, :2] - field.position_m[objects.names, :2]
@@ -118,13 +119,13 @@ def test_triangle_count_is_near_its_limit() -> None:
     viewpoint = Viewpoint(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
     # The limits are approximate.
     max_triangles = ROCK_TRIANGLES + DETAIL_TRIANGLES
-    assert 0.25 * max_triangles < len(select_rocks(rocky_ground, viewpoint).triangles) < 1.7 * max_triangles
+    assert 0.25 * max_triangles < len(_select_rocks(rocky_ground, viewpoint).triangles) < 1.7 * max_triangles
 
 
 def test_ground_without_rocks_has_no_objects() -> None:
     ground_without_rocks = SiteGround.from_site(_make_small_site("ivanpah"), "ground")
     assert ground_without_rocks.rocks is None
-    assert len(select_rocks(ground_without_rocks, Viewpoint(0.0, 0.0, 1.5, 1e-3))) == 0
+    assert len(_select_rocks(ground_without_rocks, Viewpoint(0.0, 0.0, 1.5, 1e-3))) == 0
 
 
 def test_photometry_has_the_sky_radiance_of_the_environment(ground: SiteGround) -> None:
@@ -159,7 +160,7 @@ def test_sector_contains_the_rocks_of_the_full_circle(azimuth: float) -> None:
     ground = SiteGround.from_site(_make_small_site("gusev", 512), "ground", seed=3)
     full_viewpoint = Viewpoint(0.4, 1.0, 1.2, 4e-3, max_distance_m=1.4 * ground.surface.period_m)
     sector_viewpoint = replace(full_viewpoint, azimuth_rad=azimuth, half_width_rad=0.3)
-    full_circle, sector = (select_rocks(ground, viewpoint) for viewpoint in (full_viewpoint, sector_viewpoint))
+    full_circle, sector = (_select_rocks(ground, viewpoint) for viewpoint in (full_viewpoint, sector_viewpoint))
     offsets_m = full_circle.triangles[:, 0, :2] - (0.4, 1.0)
     angle_from_axis = np.abs((np.arctan2(offsets_m[:, 0], offsets_m[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
     # Within 5 m of the viewpoint, rocks outside the sector are included for their shadows.

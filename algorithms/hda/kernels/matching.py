@@ -129,7 +129,10 @@ def refine_peak(
 def refine_positions(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int
 ) -> tuple[Array, Array]:
-    """Sub-pixel positions (u, v) in the second image and their correlations (II.A, II.C); NaN if no window fits."""
+    """Sub-pixel matches (u, v) in the second image and their correlations (II.A, II.C); NaN if no window fits.
+
+    `positions` and `shifts` are whole rows and columns; the matches are searched next to their sum.
+    """
     pixels = np.empty((positions.shape[0], 2))
     values = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):

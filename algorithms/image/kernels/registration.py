@@ -128,6 +128,8 @@ def sample_shifted(coefficients: Array, side: int, row: float, column: float, va
 
 #: Number of unknowns of each warp order: gain, offset and shift; also affine terms; also quadratic terms.
 UNKNOWNS = (4, 8, 14)
+#: Determinant of the affine part of a step below which its inverse is not computed: the step collapses the template.
+_MIN_DETERMINANT = 0.1
 
 
 @njit(cache=True)
@@ -147,10 +149,10 @@ def build_design_matrix(template: Array, unknowns: int) -> Array:
             design_row[0], design_row[1] = template[i, j] - mean, 1.0
             design_row[2], design_row[3] = slope_y, slope_x
             y, x = i - half, j - half
-            if unknowns >= 8:
+            if unknowns >= UNKNOWNS[1]:
                 design_row[4], design_row[5] = slope_y * y, slope_y * x
                 design_row[6], design_row[7] = slope_x * y, slope_x * x
-            if unknowns >= 14:
+            if unknowns >= UNKNOWNS[2]:
                 design_row[8], design_row[9], design_row[10] = slope_y * y * y, slope_y * y * x, slope_y * x * x
                 design_row[11], design_row[12], design_row[13] = slope_x * y * y, slope_x * y * x, slope_x * x * x
     return matrix
@@ -222,7 +224,7 @@ def compose_with_inverse(warp: Array, change: Array) -> bool:
     """
     a, b, c, d = 1.0 + change[0, 0], change[0, 1], change[1, 0], 1.0 + change[1, 1]
     determinant = a * d - b * c
-    if abs(determinant) < 0.1:
+    if abs(determinant) < _MIN_DETERMINANT:
         return False
     m00, m01, m10, m11 = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
     warp[0, 0] = (m00 * d - m01 * c) / determinant
@@ -262,6 +264,7 @@ def register(
     a pure shift, 1 with affine terms, 2 also with quadratic terms. `limits` are the largest shift, the largest warp
     size and the maximum number of steps.
     """
+    max_shift, max_warp_size, max_steps = limits
     side = template.shape[0]
     half = 0.5 * (side - 1)
     unknowns = UNKNOWNS[order]
@@ -279,7 +282,7 @@ def register(
     solution = np.empty(unknowns)
     warp, change = np.eye(2, 5), np.zeros((2, 5))
     v, u, score = row, column, 0.0
-    for step in range(limits[2]):
+    for step in range(max_steps):
         if order > 0 and step > 0:
             is_inside = sample(coefficients, side, v, u, warp, values)
         else:
@@ -315,7 +318,7 @@ def register(
         dv = (warp[0, 0] * solution[2] + warp[0, 1] * solution[3]) / gain
         du = (warp[1, 0] * solution[2] + warp[1, 1] * solution[3]) / gain
         v, u = v - dv, u - du
-        if math.hypot(v - row, u - column) > limits[0] or warp_size(warp, half) > limits[1]:
+        if math.hypot(v - row, u - column) > max_shift or warp_size(warp, half) > max_warp_size:
             return failure
         # the last change of the warp moves the template's border, side / 2 from the centre, by less than ten tolerances
         if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:

@@ -322,6 +322,16 @@ def test_coarse_map_has_no_safe_cells() -> None:
     assert np.all(classify_footprints(ground, coarse, options) == Safety.HAZARD)
 
 
+@pytest.mark.parametrize("diameter_m", [0.05, 0.1, 0.19])
+def test_footprint_of_a_cell_or_less_has_the_plane_of_its_neighbours(diameter_m: float) -> None:
+    options = replace(OPTIONS, lander_diameter_m=diameter_m, narrowest_hazard=100.0, level_error_rad=0.0)
+    expected = np.full((80, 100), Safety.UNKNOWN)
+    expected[1:-1, 1:-1] = Safety.SAFE
+    np.testing.assert_array_equal(classify_footprints(make_ground(slope_x=0.1), SHARP, options), expected)
+    steep = classify_footprints(make_ground(slope_x=0.4), SHARP, options)
+    assert np.all(steep[1:-1, 1:-1] == Safety.HAZARD)
+
+
 @pytest.mark.parametrize(("row", "column"), [(40, 50), (41, 53), (37, 60)])
 def test_each_position_is_checked_with_its_own_footprint(row: int, column: int) -> None:
     """A boulder of one cell is a hazard for footprints within a lander radius and one cell, 5 + 1 cells, and no other.

@@ -5,6 +5,7 @@ The matching stages are replaced by functions with given results (`Stages`), or 
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,6 +255,27 @@ def test_measurements_outside_of_the_inertial_data_are_not_used(
     assert after.outcome is before.outcome
     if before.position_m is not None:
         np.testing.assert_array_equal(after.position_m, before.position_m)
+
+
+@pytest.mark.parametrize("name", ["coarse_images", "coarse_altitudes", "acquisition_landmarks"])
+def test_numbers_of_images_altitudes_and_landmarks_are_positive(name: str) -> None:
+    options: dict[str, Any] = {name: 0}
+    with pytest.raises(ValueError, match=f"{name} is 0; it must be at least 1"):
+        LvsOptions(**options)
+
+
+@pytest.mark.parametrize("make_estimator", [MapRelativeEstimator, InertialEstimator, FeatureEstimator])
+@pytest.mark.parametrize("altitude_m", [0.0, -3.0, np.nan])
+def test_altitudes_that_are_not_positive_give_no_fix(
+    make_estimator: type[InertialEstimator | MapRelativeEstimator], altitude_m: float
+) -> None:
+    estimator = make_estimator()
+    estimator.start(make_initial(), FLAT_MAP)
+    for number, image in enumerate(make_images(4)):
+        estimator.process_increments(make_increments(float(number), image.time_s))
+        estimator.process_altitude(AltitudeMeasurement(altitude_m, image.time_s))
+        expected = VALID if make_estimator is InertialEstimator else NO_COARSE_FIX
+        assert estimator.process_image(image).outcome is expected
 
 
 def test_ignored_altitude_does_not_set_the_scale_of_the_coarse_stage(make_stages: Callable[..., Stages]) -> None:

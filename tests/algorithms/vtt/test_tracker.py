@@ -315,6 +315,18 @@ def test_lucas_kanade_tracker_follows_the_target_in_the_same_loop() -> None:
     assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 2.5
 
 
+def test_lucas_kanade_tracker_loses_a_target_next_to_the_image() -> None:
+    """The predicted pixel is 24 px outside of the left subframe, but the search window overlaps the subframe."""
+    target = np.array([6.0, 0.1, 0.2])
+    drive = Drive(make_scene(make_face(3, target), target, 3), navcam(), lucas_kanade_tracker(SMALL_WINDOW))
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    assert drive.stop(pose(0.0, 0.0)).tracked
+    first = drive.measurements[-1]
+    turned = replace(first, azimuth_rad=first.azimuth_rad + 86.0 / navcam().left.focal_lengths[0])
+    update = drive.tracker.update(turned)
+    assert (update.state, update.losses) == (TrackingState.LOST, (TargetLoss.OUT_OF_VIEW,))
+
+
 @pytest.mark.parametrize(
     "invalid",
     [

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
@@ -102,6 +103,11 @@ def test_images_can_be_repeated_or_black() -> None:
     assert [int(entry[0, 0]) for entry in corrupt_images(images, 3, 0)] == [1, 2, 2]
     assert [int(entry[0, 0]) for entry in corrupt_images(images, 0, 1)] == [0, 2, 3]
     assert [int(entry[0, 0]) for entry in images] == [1, 2, 3]
+
+
+def test_first_image_cannot_be_a_repeated_one() -> None:
+    with pytest.raises(ValidationError, match="repeated_image is 1, which no image precedes"):
+        DescentFaults(repeated_image=1)
 
 
 def test_altitude_and_attitude_faults_have_the_specified_size() -> None:

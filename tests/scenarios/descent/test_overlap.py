@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.conformance.parts import swinging_fall
-from marsyard.scenarios.descent.conditions import ZERO_PHASE_RADIUS_RAD, footprint, overlap_width_m, zero_phase_spot
+from marsyard.scenarios.descent.overlap import ZERO_PHASE_RADIUS_RAD, footprint, overlap_width_m, zero_phase_spot
 from marsyard.scenarios.descent.parameters import TouchdownParameters
 from marsyard.scenarios.descent.touchdown import compute_touchdown
 from marsyard.sim.camera import CameraModel

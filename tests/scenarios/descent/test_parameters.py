@@ -28,6 +28,7 @@ SITES = ("gusev", "ivanpah")
         ({"algorithm": "marsyard.algorithms.dimes:Nothing"}, "cannot import algorithm"),
         ({"dimes": {"templates": 3}}, "templates"),
         ({"faults": {"hase": 1.0}}, "hase"),
+        ({"faults": {"altitude_error": 0.1}, "exact_instruments": True}, "altitude_error has no effect with exact"),
     ],
 )
 def test_invalid_parameters_are_reported(invalid: dict[str, Any], message: str) -> None:

@@ -18,6 +18,7 @@ from marsyard.campaigns.definition.components import own_limits
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
+from marsyard.scenarios.isolation import remote
 from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
 from marsyard.scenarios.rover.task import TRACKING
@@ -62,6 +63,18 @@ def test_workers_get_the_devices_in_turn(log: Path, monkeypatch: pytest.MonkeyPa
         end_idle_programs()
     lines = log.read_text().splitlines()
     assert [line.split()[2] for line in lines if line.startswith("construct")] == ["cuda:0", "cuda:1", "cuda:0"]
+
+
+def test_time_of_a_process_that_has_ended_after_its_answer_is_not_negative(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_s = [5.0]
+
+    def processor_time_s(_process: int) -> float:
+        if not times_s:
+            raise ProcessLookupError
+        return times_s.pop()
+
+    monkeypatch.setattr(remote, "processor_time_s", processor_time_s)
+    assert run_case("Counting").row["estimation_time_s"] >= 0.0
 
 
 def test_random_numbers_depend_on_the_inputs_and_not_on_earlier_cases() -> None:

@@ -20,9 +20,10 @@ from marsyard.scenarios.hda_stage_columns import stage_row
 from marsyard.scenarios.landing.conditions import site_populations
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.map_score import SampledMap, map_errors, map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import SampledMap, landing_row, map_errors, map_row, site_row
+from marsyard.scenarios.landing.score import landing_row, site_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset

@@ -7,7 +7,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing import kernels
-from marsyard.scenarios.landing.flight import choose_pair
+from marsyard.scenarios.landing.pair_choice import choose_pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.landing.relief import Limits, Relief
 from marsyard.scenarios.landing.scenario import LandingScenario

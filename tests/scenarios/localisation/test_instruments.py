@@ -13,7 +13,8 @@ from marsyard.scenarios.localisation.camera import (
     true_camera,
 )
 from marsyard.scenarios.localisation.flight import LanderFlight
-from marsyard.scenarios.localisation.instruments import RADAR, InitialErrors, measure_altitudes
+from marsyard.scenarios.localisation.initial_state import InitialErrors
+from marsyard.scenarios.localisation.instruments import RADAR, measure_altitudes
 from marsyard.sim.sensor import Detector, RadarAltimeter
 from marsyard.sim.terrain import Surface
 

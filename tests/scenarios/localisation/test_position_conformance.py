@@ -10,7 +10,7 @@ import pytest
 
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.conformance import create_subject
-from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, subject_kinds
+from marsyard.scenarios.conformance.candidates import Subject, determine_task, list_checks, subject_kinds
 from marsyard.scenarios.localisation import conformance as inputs
 from marsyard.sim.measurements import ImuIncrements
 from tests.scenarios import suites
@@ -206,7 +206,7 @@ def test_estimators_and_programs_have_the_localisation_suite() -> None:
     assert [determine_task(name) for name in ("lvs", "sift", "inertial")] == ["localisation"] * 3
     assert determine_task("marsyard.algorithms.localisation.estimator:MapRelativeEstimator") == "localisation"
     assert create_subject("inertial", None, 60.0).task == "localisation"
-    names = [name for name, _ in check_names(CandidateAlgorithm("serve:cat", "localisation", 60.0))]
+    names = [name for name, _ in list_checks(Subject("serve:cat", "localisation", 60.0))]
     assert "start" in names
     assert "inputs" not in names  # a program receives files
 

@@ -18,7 +18,7 @@ from marsyard.scenarios.condition_columns import contrast_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisationScenario
-from marsyard.scenarios.localisation.simulation import LEAD_S, LocalisedDescent
+from marsyard.scenarios.localisation.simulation import INERTIAL_LEAD_S, LocalisedDescent
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
@@ -117,7 +117,7 @@ def test_initial_error_is_the_drawn_one() -> None:
     """With an exact map the column is the drawn error; otherwise the map's local shift is added to the drawn error."""
     exact = _run(algorithm="inertial", exact_instruments=True, **{**COARSE, "map": {"side_px": 64, **EXACT_MAP}})
     descent = _simulate()
-    p, truth = descent.p, descent.flight.state(-LEAD_S)
+    p, truth = descent.p, descent.flight.state(-INERTIAL_LEAD_S)
     # the drawn position depends neither on the time of 0 s nor on the gravity of 3.71 m/s2
     drawn = p.initial.draw(truth, 0.0, 3.71, Streams(1, "loc tests", 0).generator("initial state"))
     error = truth.position_m[:2] - drawn.position_m[:2]

@@ -48,6 +48,14 @@ def _make_map_truth(shift_m: np.ndarray = SHIFT_M, distortion_x_m: float = 0.0) 
     return MapTruth(shift_m, east, none, none, 1.0)
 
 
+def _make_images(tags_s: Sequence[float]) -> tuple[Any, ...]:
+    """Return images with these time tags; the counts of each are its number, from 1."""
+    return tuple(
+        SimpleNamespace(counts=np.full((4, 4), number, dtype=np.uint16), time_s=tag_s)
+        for number, tag_s in enumerate(tags_s, start=1)
+    )
+
+
 def _make_descent(**changes: Any) -> Any:
     """Return the parts of a `LocalisedDescent` that the score of answers uses."""
     rows = np.arange(40.0, dtype=np.float32).reshape(5, 8)
@@ -59,7 +67,7 @@ def _make_descent(**changes: Any) -> Any:
             "flight": flight,
             "states": tuple(flight.state(time_s) for time_s in IMAGE_TIMES_S),
             "map_truth": _make_map_truth(),
-            "images": tuple(SimpleNamespace(counts=np.full((4, 4), k, dtype=np.uint16)) for k in (1, 2, 3, 4)),
+            "images": _make_images(IMAGE_TIMES_S),
             "imu_offset_s": IMU_OFFSET_S,
             "measurements": SimpleNamespace(initial=initial, map_product=product),
             **changes,
@@ -225,7 +233,7 @@ def test_products_of_valid_and_refused_estimates() -> None:
     answers = _answers(
         _refusal(2.0), _estimate(6.0, [3.0, 4.0, 5.0], details=details), _estimate(END_S, [1.0, 2.0, 3.0])
     )
-    stored = case_products(_make_descent(), answers)
+    stored = case_products(_make_descent(images=_make_images(IMAGE_TIMES_S[:2])), answers)
     assert stored["outcomes"] == ["NO_COARSE_FIX", "VALID", "VALID"]
     assert np.isnan(stored["track"][0]).all()
     np.testing.assert_allclose(stored["track"][1], [6.5, 3.0, 4.0, 5.0, 2.0, 3.0, 5.0], atol=1e-9)
@@ -239,8 +247,25 @@ def test_products_of_valid_and_refused_estimates() -> None:
     assert stored["map"].dtype == np.uint8
     np.testing.assert_array_equal(stored["landmarks_px"], pixels)
     np.testing.assert_array_equal(stored["landmarks_used"], flags)
-    assert (stored["image_1"][0, 0], stored["image_2"][0, 0]) == (1, 4)
+    assert (stored["image_1"][0, 0], stored["image_2"][0, 0]) == (1, 2)
     assert pack_products(stored).size > 0
+
+
+def test_landmarks_are_those_of_the_last_image_if_its_tag_is_earlier() -> None:
+    """The clock's errors exchange the tags of the last two images: the second estimate answers the last image."""
+    flags = np.ones(1, dtype=bool)
+    estimates = [
+        _estimate(
+            time_s,
+            [0.0, 0.0, 0.0],
+            details=LocalisationDetails("fine", measured_px=np.full((1, 2), time_s), residuals_px=None, used=flags),
+        )
+        for time_s in (2.0, 6.0, 9.9)
+    ]
+    images = _make_images((2.0, 9.9, 6.0))
+    stored = case_products(_make_descent(images=images), _answers(*estimates, _refusal(END_S)))
+    assert stored["image_2"][0, 0] == 3
+    np.testing.assert_array_equal(stored["landmarks_px"], [[6.0, 6.0]])
 
 
 def test_products_without_images() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.measured.matching import PairAgreement, PairMatches, agreement_row, epipolar_offsets_px
+from marsyard.scenarios.measured.pose_agreement import PairAgreement, PairMatches, agreement_row, epipolar_offsets_px
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import rigid
 

@@ -1,5 +1,6 @@
 """Tests of the frames of camera models: each pose of a label is applied once, and camera files name their frame."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,20 @@ def test_models_in_a_fixed_frame_are_refused_for_poses_of_the_table(
     )
     with pytest.raises(IngestError, match=r"line 2: .*0.img: the camera model is in the frame MCMF_FRAME"):
         ingest(folder, tmp_path / "out")
+
+
+def test_camera_file_of_another_size_than_the_product_is_refused(
+    tmp_path: Path, folder: Path, small_camera: Cahvor
+) -> None:
+    pds3_label(folder, small_camera, "ROVER_FRAME", name="0.img")
+    write_cahvor(replace(small_camera, size=(24, 32)), folder / "other.cahvor", frame=BODY_FRAME)
+    write_folder(
+        folder,
+        ["case,file,camera,time_s,qx,qy,qz,qw", *(f"a,0.img,other.cahvor,{time},1,0,0,0" for time in (0, 1))],
+        '[poses]\naxes = "enu"\nattitude_of = "camera"\n',
+    )
+    with pytest.raises(IngestError, match=r"line 2: .*0.img: has 32 x 32 pixels; its camera has 24 x 32"):
+        ingest(folder, tmp_path)
 
 
 @pytest.mark.parametrize("other", ["SITE_FRAME", "table"])

@@ -17,8 +17,9 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.scenarios.localisation.parameters import MapParameters
 from marsyard.scenarios.localisation.world import LocalisationWorld
-from marsyard.scenarios.measured import over_map, store
+from marsyard.scenarios.measured import counterparts, store
 from marsyard.scenarios.measured.columns import MAP_COLUMNS
+from marsyard.scenarios.measured.counterparts import CounterpartParameters, render_counterpart
 from marsyard.scenarios.measured.image_files import read_counts
 from marsyard.scenarios.measured.map_matching import MATCHERS, MapComparison, compare_with_map
 from marsyard.scenarios.measured.map_registration import load_map
@@ -322,16 +323,13 @@ def test_rendered_map_has_the_stated_sharpness(flight: store.CasesFile, monkeypa
         parameters.append(p)
         raise StopIteration
 
-    monkeypatch.setattr(over_map, "make_map", make_map)
+    monkeypatch.setattr(counterparts, "make_map", make_map)
     monkeypatch.setattr(LocalisationWorld, "from_parameters", lambda *_, **__: None)
     (image,) = store.load_images(flight, flight.stored.cases[0])
     recorded = PosedImage.from_detector(image, np.zeros(3), Rotation.identity())
-    for p in (
-        over_map.CounterpartParameters(),
-        over_map.CounterpartParameters(map_aperture_px=0.4, map_nyquist_mtf=0.8),
-    ):
+    for p in (CounterpartParameters(), CounterpartParameters(map_aperture_px=0.4, map_nyquist_mtf=0.8)):
         with pytest.raises(StopIteration):
-            over_map.render_counterpart(recorded, mapped, 255, None, p, STREAMS, is_level=True)
+            render_counterpart(recorded, mapped, 255, None, p, STREAMS, is_level=True)
     defaults = MapParameters()
     assert [(p.aperture_px, p.nyquist_mtf) for p in parameters] == [
         (defaults.aperture_px, defaults.nyquist_mtf),

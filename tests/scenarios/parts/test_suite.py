@@ -147,6 +147,18 @@ def test_score_defects_are_reported(
     assert problem in result.problem
 
 
+@pytest.mark.parametrize(
+    ("annotation", "kind"),
+    [(": ScoredVelocity | ScoredSite | ScoredRun", "score"), (": ScoredRun", "score"), ("", "velocity")],
+)
+def test_annotation_identifies_a_score(
+    annotation: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header = "from marsyard.scenarios.parts import ScoredRun, ScoredSite, ScoredVelocity\n"
+    name = write_module(tmp_path, monkeypatch, f"{header}def count(case{annotation}):\n    return {{}}\n")
+    assert determine_task(f"{name}:count") == kind
+
+
 def test_nearest_ground_distance_in_a_cone_matches_the_plane() -> None:
     """Independent method: intersect a grid of rays in the cone with the suite's ground, the plane z = 0.05 x."""
     apex = np.array([30.0, -20.0, 500.0])

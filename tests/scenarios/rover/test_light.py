@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.rover.closed_loop import run_case
+from marsyard.scenarios.rover.figures import run_timeline
 from marsyard.scenarios.rover.parameters import MastCameraParameters, MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run_state import RoverRun
@@ -54,6 +55,16 @@ def test_camera_replaces_the_optics_of_its_detector_only_if_given() -> None:
     for changes in ({}, dict.fromkeys(optics, 0), {"stray_light": 0.3}):
         parameters = MastCameraParameters.model_validate({**own, **changes}).detector_parameters()
         assert {name: getattr(parameters.optics, name) for name in optics} == {**optics, **changes}
+
+
+def test_images_without_noise_have_the_bits_of_their_timeline() -> None:
+    """A 10-bit camera without detector noise has counts of 12 bits, and its timeline states 12."""
+    camera = {"preset": "research-navcam", "detector_noise": False}
+    run = make_run(camera=camera, legs=[{"motion": "stay", "steps": 1}])
+    images = run_timeline(run.setup.camera.parameters, run).images
+    assert images
+    for image in images:
+        assert 2 ** (image.bits - 1) <= image.counts.max() < 2**image.bits
 
 
 def test_bright_sky_underexposes_full_frames() -> None:

@@ -22,7 +22,8 @@ from marsyard.scenarios.rover.points import (
 )
 from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.scenarios.rover.scenario import RoverScenario
-from marsyard.scenarios.rover.shared_drive import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.shared_drive import SharedDriveScenario
+from marsyard.scenarios.rover.shared_drive_parameters import SharedDriveParameters
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
 

@@ -12,7 +12,8 @@ from marsyard.algorithms.vtt import prediction
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.rover import closed_loop as closed_loop
-from marsyard.scenarios.rover.closed_loop import run_case
+from marsyard.scenarios.rover.closed_loop import prepare_run, run_case
+from marsyard.scenarios.rover.conditions import fixed_conditions
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
@@ -71,6 +72,24 @@ def test_approach_reaches_distance_and_offset() -> None:
     assert not is_finished(leg, 3, make_target(2.0 + 1.1 * GOAL_TOLERANCE_M, 0.0))
     offset_leg = LegParameters(motion="approach", goal_m=2.0, offset_right_m=0.5)
     np.testing.assert_allclose(goal_position(offset_leg, make_target(5.0, 0.0)), [3.0, -0.5])
+
+
+@pytest.mark.parametrize("motion", ["approach", "back-off"])
+@pytest.mark.parametrize("step_m", [0.0, -0.5])
+def test_step_towards_a_goal_is_positive(motion: str, step_m: float) -> None:
+    """A negative step would drive away from the goal, and zero would not drive at all."""
+    with pytest.raises(ValueError, match=f"step_m is {step_m:g}; allowed for motion '{motion}': above 0"):
+        LegParameters.model_validate({"motion": motion, "step_m": step_m})
+    assert LegParameters(motion="straight", step_m=step_m).step_m == step_m
+
+
+def test_map_of_the_first_leg_is_stated() -> None:
+    """A leg that only maps first has a map, too."""
+    for leg, source in (({"maps_first": True, "map_by": "body"}, "body"), ({"map_by": "body"}, "none")):
+        parameters = RoverScenarioParameters.model_validate({**SHORT_RUN, "legs": [{"motion": "stay", **leg}]})
+        run = prepare_run(parameters, Streams(1, "rover tests", 0))
+        assert fixed_conditions(parameters, run)["map_by"] == source
+        assert (run.setup.navigation_cameras.body is not None) is (source == "body")
 
 
 def test_circle_keeps_target_distance_and_bearing() -> None:

@@ -10,13 +10,8 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.scenario import RoverScenario
-from marsyard.scenarios.rover.shared_drive import (
-    DriveKey,
-    SharedDriveParameters,
-    SharedDriveScenario,
-    render_drive,
-    track_views,
-)
+from marsyard.scenarios.rover.shared_drive import DriveKey, SharedDriveScenario, render_drive, track_views
+from marsyard.scenarios.rover.shared_drive_parameters import SharedDriveParameters
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
@@ -166,6 +161,33 @@ def test_unknown_trackers_and_cameras_are_rejected() -> None:
         make_parameters(algorithm="vt")
     with pytest.raises(ValueError, match="no mast has the camera preset 'xc-55'"):
         make_parameters(camera={"preset": "xc-55"})
+
+
+def test_step_of_a_shared_drive_is_that_of_its_leg() -> None:
+    """A leg with a fixed step ignores `step_fraction`; every third stop triples the step."""
+    steps = {
+        "approach": ({"step_fraction": 0.1}, 1.0 - 0.9**3),
+        "straight": ({"step_m": -0.2}, 0.6),
+        "circle": ({"step_deg": -5.0}, 15.0),
+    }
+    for motion, (leg, step) in steps.items():
+        parameters = SharedDriveParameters.model_validate(
+            {"drive": {"legs": [{"motion": motion, **leg}]}, "variants": [{}], "targets": [{}], "skipped_stops": 2}
+        )
+        assert parameters.step == pytest.approx(step)
+
+
+def test_terrains_of_a_shared_drive_are_in_the_bank() -> None:
+    values = {"drive": {"world": {"bank": 2}}, "variants": [{"terrain": 1}, {"terrain": 2}], "targets": [{}]}
+    with pytest.raises(ValueError, match=r"variants\[1\].terrain is 2; allowed: 0 to 1"):
+        SharedDriveParameters.model_validate(values)
+
+
+def test_runs_of_the_other_scenario_are_rejected() -> None:
+    """A shared drive would ignore them."""
+    values = {"drive": {"variants": [{"diameter_m": 0.2}]}, "variants": [{}], "targets": [{}]}
+    with pytest.raises(ValueError, match="allowed in a shared drive: variants"):
+        SharedDriveParameters.model_validate(values)
 
 
 @pytest.mark.slow
