@@ -49,7 +49,7 @@ class DefinitionError(CampaignError):
 
 def suggest_similar(word: str, allowed: Iterable[str]) -> str:
     """Return ``(did you mean 'x'?)`` with a leading space if an allowed word is similar; otherwise an empty text."""
-    matches = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
+    matches = difflib.get_close_matches(word, list(allowed), n=1)
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 

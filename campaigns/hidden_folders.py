@@ -6,8 +6,10 @@ import re
 
 def hide_folders(text: str) -> str:
     """Replace the cache folder of this user by ``$MARSYARD_CACHE`` and the home folder by ``~``, for files to share."""
-    for name, folder in (("$MARSYARD_CACHE", os.environ.get("MARSYARD_CACHE", "")), ("~", os.environ.get("HOME", ""))):
-        if len(folder.rstrip("/")) > 1 and folder.rstrip("/") in text:
-            # a path ends at a character that no name contains; it is no part of another path or of base64 text
-            text = re.sub(rf"(?<![\w+.~-]){re.escape(folder.rstrip('/'))}(?![\w+.-])", name, text)
+    for name, variable in (("$MARSYARD_CACHE", "MARSYARD_CACHE"), ("~", "HOME")):
+        folder = os.environ.get(variable, "").rstrip("/")
+        if len(folder) > 1 and folder in text:
+            # a path ends at a character that no name contains, or at the full stop of a sentence; it is no part of
+            # another path or of base64 text
+            text = re.sub(rf"(?<![\w+.~-]){re.escape(folder)}(?!\.*[\w+-])", name, text)
     return text

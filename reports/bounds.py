@@ -35,6 +35,7 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
     n, failures = int(member.sum()), int((member & ~success).sum())
     first_n = n if looks.in_first_look is None else int((member & looks.in_first_look).sum())
     risk = 1.0 - verdict.confidence
+    # PASS shows that failures are rare enough, FAIL that successes are
     pass_test, fail_test = (
         SequentialTest(rate, risk, first_n) for rate in (1.0 - verdict.probability, verdict.probability)
     )
@@ -42,7 +43,6 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
         confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
     else:
         confidences = (confidence_at(verdict.confidence, looks.risk_fraction),) * 2
-    additional: int | None = None
     if looks.in_first_look is None and looks.risk_fraction < 1.0:
         additional = proportions.additional_cases_needed(n, failures, verdict.probability, confidences[0])
     else:

@@ -21,10 +21,12 @@ MAX_CLOSURE_ERROR = 0.1
 REMAINING = "remaining without any source"
 #: Number of dispersions in the table of Sobol's indices.
 _MAX_INDICES = 12
+#: Height of a bar of the figure, whose rows have a distance of 1.
+_BAR_HEIGHT = 0.62
 
 
 def signed_percent(fraction: float) -> str:
-    """Format a fraction of the total with one decimal; contributions can be negative, and above 100 %."""
+    """Format a fraction of the total in per cent; contributions can be negative, and above 100 %."""
     return f"{100.0 * fraction:z.1f} %".replace("-", "−")
 
 
@@ -37,16 +39,15 @@ def budget_sentences(record: Mapping[str, Any]) -> list[str]:
     sentences: list[str] = []
     budget = result.budget
     if budget is not None:
+        largest_contributions = [item for item in budget.contributions[:3] if item.mean > 0.0]
         largest = ", ".join(
-            f"{item.title} {signed_percent(item.mean / budget.total)}"
-            for item in budget.contributions[:3]
-            if item.mean > 0
+            f"{item.title} {signed_percent(item.mean / budget.total)}" for item in largest_contributions
         )
         sentences += [
             f"{parameters.requirement}: {_statistic(result)} of {label(result.quantity)}: "
             f"{number(math.sqrt(budget.total))} with all sources of error, {_format_root(budget.remaining)} without "
             f"any, from the {budget.common} of {count(result.cases, 'base case')} that were answered in every variant.",
-            f"Largest contributions to the mean square: {largest}; "
+            f"Largest contributions to the mean square: {largest or 'none'}; "
             f"{REMAINING} {signed_percent(budget.remaining / budget.total)}.",
             _closure_sentence(budget, parameters.confidence),
         ]
@@ -93,6 +94,7 @@ def budget_section(subject: Subject) -> Section | None:
 
 
 def _budget_block(result: BudgetResult, budget: Budget, confidence: float) -> Block:
+    """Create figure and table of the contributions of the sources of error."""
     unit, total, n_cases = split_unit(result.quantity)[1], budget.total, result.cases
     root_unit = f", {unit}" if unit else ""
     head = [
@@ -107,7 +109,7 @@ def _budget_block(result: BudgetResult, budget: Budget, confidence: float) -> Bl
             signed_percent(0.5 * (item.removed - item.alone) / total),
             _format_root(item.alone + budget.remaining),
             _format_root(total - item.removed),
-            f"{item.answered[1]}, {item.answered[0]}",
+            ", ".join(map(str, reversed(item.answered))),  # with it only, without it
         ]
         for item in budget.contributions
     ]
@@ -139,6 +141,7 @@ def _format_root(square: float) -> str:
 
 
 def _index_block(result: BudgetResult) -> Block:
+    """Create the table of Sobol's indices."""
     indices = result.indices
     rows = [
         [
@@ -169,16 +172,22 @@ def _draw_waterfall(budget: Budget, axis_label: str) -> Figure:
     titles = [REMAINING, *(item.title for item in contributions), "all sources of error"]
     rows = range(len(titles))
     level = budget.remaining
-    axes.barh(0, level, color=SERIES[5], height=0.62)
+    axes.barh(0, level, color=SERIES[5], height=_BAR_HEIGHT)
     for row, item in enumerate(contributions, start=1):
         color = SERIES[0] if item.mean >= 0.0 else SERIES[1]
-        axes.barh(row, item.mean, left=level, color=color, height=0.62)
+        axes.barh(row, item.mean, left=level, color=color, height=_BAR_HEIGHT)
         axes.plot([level + item.lower, level + item.upper], [row, row], color=INK, linewidth=1.2)
         # connect the end of the previous bar with the start of this bar
-        axes.plot([level, level], [row - 1.31, row + 0.31], color=GRID, linewidth=0.8, zorder=0)
+        axes.plot(
+            [level, level],
+            [row - 1.0 - 0.5 * _BAR_HEIGHT, row + 0.5 * _BAR_HEIGHT],
+            color=GRID,
+            linewidth=0.8,
+            zorder=0,
+        )
         level += item.mean
     last = len(titles) - 1
-    axes.barh(last, budget.total, color=SERIES[2], height=0.62)
+    axes.barh(last, budget.total, color=SERIES[2], height=_BAR_HEIGHT)
     axes.plot([budget.total_lower, budget.total_upper], [last, last], color=INK, linewidth=1.2)
     axes.set_yticks(list(rows), titles)
     axes.invert_yaxis()

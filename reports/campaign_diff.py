@@ -21,14 +21,8 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.decision import requirement_masks
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid
-from marsyard.reports.statistics.difference_tests import (
-    Metric,
-    Sample,
-    compare_successes,
-    correct_holm,
-    difference_p_value,
-    symmetry_p_value,
-)
+from marsyard.reports.statistics.difference_tests import Metric, Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.paired_tests import compare_successes, symmetry_p_value
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import NOTHING, label, number, p_text, percent
 
@@ -62,7 +56,7 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
 
     Metrics: success of each requirement, errors, "answered", and "came to an end" (the case was completed).
     """
-    frame = read_sampling_design(run.definition).exclude_nominal_case(run.frame)
+    frame = read_sampling_design(run.definition).exclude_nominal_case(run.all_cases)
     metrics: dict[str, Metric] = {}
     terrains = number_stored_terrains(frame)
 
@@ -90,17 +84,21 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
     """Return whether the campaigns' cases are paired, and the comparisons of the metrics of both campaigns."""
-    frames, metrics = zip(*(list_metrics(run) for run in (first, second)), strict=True)
+    (first_frame, first_metrics), (second_frame, second_metrics) = list_metrics(first), list_metrics(second)
     are_paired = have_same_draws(first, second)
-    second_metrics = {metric.name: metric for metric in metrics[1]}
-    metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
-    share_terrains = have_same_terrains(first, second)
+    seconds_by_name = {metric.name: metric for metric in second_metrics}
+    metric_pairs = [
+        (metric, seconds_by_name[metric.name]) for metric in first_metrics if metric.name in seconds_by_name
+    ]
+    # cases without terrains are independent of each other, as the cases of one and the same terrain
+    has_terrains = any(rates.terrain_groups(frame) is not None for frame in (first_frame, second_frame))
+    share_terrains = have_same_terrains(first, second) or not has_terrains
     p_values = correct_holm(
         [
-            _paired_p_value(frames[0], pair[0], frames[1], pair[1])
+            _paired_p_value(first_frame, first_metric, second_frame, second_metric)
             if are_paired
-            else _unpaired_p_value(*pair, share_terrains)
-            for pair in metric_pairs
+            else _unpaired_p_value(first_metric, second_metric, share_terrains)
+            for first_metric, second_metric in metric_pairs
         ]
     )
     return are_paired, [MetricComparison(*pair, p_value) for pair, p_value in zip(metric_pairs, p_values, strict=True)]
@@ -151,7 +149,7 @@ def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str
 
 
 def number_stored_terrains(frame: pd.DataFrame) -> Int[np.ndarray, " n"]:
-    """Return the stored terrain numbers of cases, which are comparable between campaigns."""
+    """Return the stored terrain numbers of cases, which are comparable between campaigns; 0 without any terrain."""
     groups = rates.terrain_groups(frame)
     if groups is None:
         return np.zeros(len(frame), dtype=np.int64)
@@ -161,6 +159,7 @@ def number_stored_terrains(frame: pd.DataFrame) -> Int[np.ndarray, " n"]:
 
 
 def _unpaired_p_value(first: Metric, second: Metric, share_terrains: bool) -> float:
+    """Compare a metric of different cases; share_terrains: whether equal terrain numbers are the same terrain."""
     first_sample, second_sample = first.sample, second.sample
     if not share_terrains:  # equal numbers are different terrains: shift the second numbers above the first
         if not first_sample.terrains.size or not second_sample.terrains.size:
@@ -171,6 +170,7 @@ def _unpaired_p_value(first: Metric, second: Metric, share_terrains: bool) -> fl
 
 
 def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric) -> float:
+    """Compare a metric of the cases that both campaigns have; NaN without such a case."""
     _, first_index, second_index = np.intersect1d(first["case"], second["case"], return_indices=True)
     first_values, second_values = first_metric.sample.values[first_index], second_metric.sample.values[second_index]
     finite = np.isfinite(first_values) & np.isfinite(second_values)
@@ -179,5 +179,6 @@ def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFr
     groups = rates.terrain_groups(first)
     finite_groups = None if groups is None else groups[first_index][finite]
     if first_metric.is_rate:
-        return compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)[2]
+        _, _, p_value = compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)
+        return p_value
     return symmetry_p_value(second_values[finite] - first_values[finite], finite_groups)

@@ -19,12 +19,13 @@ from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, tables
 from marsyard.reports.budget import budget_section, budget_sentences
 from marsyard.reports.column_selection import primary_metric
-from marsyard.reports.common_sections import consistency_section
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
+from marsyard.reports.consistency import consistency_section
 from marsyard.reports.convergence import convergence_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.influences import boundary_section, drivers_section
+from marsyard.reports.failure_boundary import boundary_section
+from marsyard.reports.influences import drivers_section
 from marsyard.reports.page import page_context
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.populations import outcome_counts

@@ -22,9 +22,9 @@ from marsyard.reports.statistics.clustered_cases import ClusteredCases
 Mask = Bool[np.ndarray, " n"]  #: Property of each case.
 Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
 
-#: Kinds of cases that the record counts on each terrain: successes and failures of the population and other cases, in
-#: the first look, then those of later looks.
-_KINDS = 6
+#: Kinds of cases that the record counts on each terrain: successes (0) and failures (1) of the population and other
+#: cases (2) of the first look, then the same kinds of later looks (3 to 5).
+_KINDS_PER_LOOK, _KINDS = 3, 6
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class CaseEvidence:
         terrains with these values, or the name of a terrain that other confirmations can use.
         """
         groups, terrains = self.terrain_groups, int(self.terrain_groups.max(initial=-1)) + 1
-        kinds = np.select([self.success, self.member], [0, 1], 2) + np.where(self.in_first_look, 0, 3)
+        kinds = np.select([self.success, self.member], [0, 1], 2) + np.where(self.in_first_look, 0, _KINDS_PER_LOOK)
         counts = np.bincount(groups * _KINDS + kinds, minlength=terrains * _KINDS).reshape(terrains, _KINDS).tolist()
         if self.labels is not None:
             return [[*values, label] for values, label in zip(counts, self.labels, strict=True)]
@@ -126,7 +126,8 @@ class CaseEvidence:
         counts = np.array(terrains, dtype=np.int64).reshape(-1, _KINDS)
         kinds = np.repeat(np.tile(np.arange(_KINDS), len(counts)), counts.ravel())
         groups = np.repeat(np.repeat(np.arange(len(counts)), _KINDS), counts.ravel())
-        return cls(kinds % 3 == 0, kinds % 3 < 2, groups, (kinds < 3) & is_first, labels, is_first)
+        kind_of_look, in_first_look = kinds % _KINDS_PER_LOOK, (kinds < _KINDS_PER_LOOK) & is_first
+        return cls(kind_of_look == 0, kind_of_look < 2, groups, in_first_look, labels, is_first)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ import math
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from marsyard.campaigns.definition.margins import MAX_VIOLATION_MARGIN
 from marsyard.reports import populations
 from marsyard.reports.column_values import numbers
 from marsyard.reports.verdicts import Verdict
@@ -29,18 +30,13 @@ def compute_margins(frame: pd.DataFrame, verdict: Verdict, margin_column: str | 
         margins = verdict.bound - np.abs(verdict.scale * values)
     else:
         graded = numbers(frame, margin_column) if margin_column else np.full(len(frame), np.nan)
-        limited = np.where(is_met, np.maximum(graded, 0.0), np.minimum(graded, -1e-12))
+        limited = np.where(is_met, np.maximum(graded, 0.0), np.minimum(graded, MAX_VIOLATION_MARGIN))
         margins = np.where(np.isnan(graded), np.where(is_met, 1.0, -1.0), limited)
     try:
-        is_member, is_unknown = _population_masks(frame, verdict.population)
+        # unfinished cases are violations in every population, also in `completed`, which excludes them
+        flags = [name for name in verdict.population.split(" and ") if name != "completed"]
+        is_member, is_unknown = populations.population_and_unknown_masks(frame, flags)
     except ValueError:
         return None
     margins = np.where(np.isnan(margins) | is_unknown, -np.inf, margins)
     return np.where(populations.engine_failed(frame), -np.inf, np.where(is_member, margins, np.inf))
-
-
-def _population_masks(frame: pd.DataFrame, population: str) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return the masks of a population and of its cases with a missing flag, regardless of unfinished cases."""
-    return populations.population_and_unknown_masks(
-        frame, [name for name in population.split(" and ") if name != "completed"]
-    )

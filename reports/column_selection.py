@@ -86,7 +86,11 @@ def distinct_columns(frame: pd.DataFrame, names: Sequence[str]) -> list[str]:
 def category_column(frame: pd.DataFrame) -> str | None:
     """Return the first column with 2 to 6 distinct values: a column of text, or the terrain; None if there is none."""
     types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _EXCLUDED_COLUMNS.search(str(name))}
-    is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
-    names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
+    # pandas stores text as a type of its own, or as objects
+    names = [
+        name
+        for name, dtype in types.items()
+        if pd.api.types.is_string_dtype(dtype) or pd.api.types.is_object_dtype(dtype)
+    ]
     names += ["terrain"] if "terrain" in frame else []
     return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)

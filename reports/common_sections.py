@@ -1,24 +1,20 @@
-"""Sections of every campaign: availability, error ellipse, outcomes by fault, and consistency of covariances."""
+"""Sections of every campaign: availability and wrong answers, error ellipse, and outcomes by fault."""
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
-from scipy import stats
+from jaxtyping import Bool
 
 from marsyard.reports import populations, rates
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
-from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.outcomes_by_size import NO_FAULT, ExtraColumn, OutcomesBySize
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.statistics.error_summary import circular_error, error_ellipse
-from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.wording import NOTHING, format_fraction, interval, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.declared_columns import enabling_columns
@@ -29,18 +25,18 @@ def answers_section(subject: Subject) -> Section | None:
     fractions = answer_fractions(subject)
     if not fractions:
         return None
-    grid = build_grid(
-        fractions.items(),
-        {
-            "": lambda pair: pair[0],
-            "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
-            "Fraction": lambda pair: percent(pair[1].fraction),
-            f"{format_fraction(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
-            "Interval with shared terrains": lambda pair: (
-                NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
-            ),
-        },
-    )
+    rows = [
+        [
+            name,
+            f"{fraction.hits:,} of {fraction.n:,}",
+            percent(fraction.fraction),
+            rates.range_text(fraction.lower, fraction.upper),
+            NOTHING if fraction.shared_lower is None else rates.interval_text(fraction, shared=True),
+        ]
+        for name, fraction in fractions.items()
+    ]
+    head = ["", "Cases", "Fraction", f"{format_fraction(CONFIDENCE)} interval", "Interval with shared terrains"]
+    grid = Grid(head, rows)
     note = note_text("common.answers")
     return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], fractions)
 
@@ -155,49 +151,3 @@ def faults_section(subject: Subject) -> Section | None:
     caption = "Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers."
     blocks = fault_outcomes(subject.metric, subject.bound).blocks(subject.frame, "faults", caption, note)
     return create_section("faults", "Faults", "Faults by size", *blocks)
-
-
-#: Columns of normalised estimation errors squared (NEES), and their degrees of freedom.
-NEES, NEES_DIMENSION = ("velocity_nees", "position_nees"), 2
-#: Probability of the band of the mean NEES, and of the error ellipse.
-BAND_PROBABILITY = 0.95
-
-
-def evaluate_consistency(nees: Float[np.ndarray, " n"]) -> dict[str, Any]:
-    """Evaluate from the NEES of estimates whether their errors agree with their covariances.
-
-    Keys: mean NEES with its band for correct covariances, fraction of errors `inside` their ellipse with its 90 %
-    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
-    """
-    n, mean = nees.size, float(nees.mean())
-    tail = 0.5 * (1.0 - BAND_PROBABILITY)
-    # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
-    lower, upper = (float(stats.chi2.ppf(level, NEES_DIMENSION * n)) / n for level in (tail, 1.0 - tail))
-    inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, NEES_DIMENSION)).sum())
-    low, high = proportion_interval(inside, n, CONFIDENCE)
-    word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
-    band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
-    return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": word}
-
-
-def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Evaluate the consistency of all algorithms with covariances in the rows, by name."""
-    tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
-    frames = {tested_name: frame, **{name: select_algorithm(frame, name) for name in list_compared_algorithms(frame)}}
-    values = {name: [rates.finite_values(rows, column) for column in NEES] for name, rows in frames.items()}
-    return {name: evaluate_consistency(nees) for name, columns in values.items() for nees in columns if nees.size}
-
-
-def consistency_section(subject: Subject) -> Section | None:
-    """Create the section that compares reported covariances with errors; None without covariances."""
-    results = evaluate_consistencies(subject.frame)
-    if not results:
-        return None
-    rows = []
-    for name, result in results.items():
-        inside = f"{percent(result['inside'])} ({rates.range_text(result['inside_lower'], result['inside_upper'])})"
-        band = f"{number(result['lower'])} to {number(result['upper'])}"
-        rows.append([name, f"{result['n']:,}", number(result["mean"]), band, inside, result["word"]])
-    head = ["Algorithm", "Estimates", "Mean NEES", "95 % band", "Within 95 % ellipse", "Covariances are"]
-    blocks = [Block(grid=Grid(head, rows), note=note_text("common.consistency", parts=NEES_DIMENSION))]
-    return Section("consistency", "Consistency", "Reported covariances against errors", blocks, results)

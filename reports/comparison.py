@@ -2,7 +2,7 @@
 
 Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by the cases in
 which only one algorithm succeeded, errors by the differences of the cases that both answered
-(`marsyard.reports.statistics.difference_tests`). All p-values are corrected by Holm's method.
+(`marsyard.reports.statistics.paired_tests`). All p-values are corrected by Holm's method.
 """
 
 import math
@@ -18,7 +18,8 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.populations import success_mask
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.statistics.difference_tests import compare_errors, compare_successes, correct_holm
+from marsyard.reports.statistics.difference_tests import correct_holm
+from marsyard.reports.statistics.paired_tests import compare_errors, compare_successes
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, p_text, percent
 from marsyard.scenarios.columns import split_unit
 
@@ -138,12 +139,12 @@ def comparison_section(subject: Subject) -> Section | None:
     results, differences = compare_algorithms(subject.frame, subject.metric, subject.bound)
     if not results:
         return None
-    grids = comparison_grids(results, differences, subject.metric)
+    result_grid, difference_grid = comparison_grids(results, differences, subject.metric)
     tested_name = results[0].name
     note = note_text("common.comparison", tested=tested_name, confidence=format_fraction(CONFIDENCE))
-    blocks = [Block(grid=grids[0])]
+    blocks = [Block(grid=result_grid)]
     if differences:
-        blocks.append(Block(heading=f"Against {tested_name}", grid=grids[1], note=note))
+        blocks.append(Block(heading=f"Against {tested_name}", grid=difference_grid, note=note))
     data = {"algorithms": results, "against": tested_name, "differences": differences}
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
 

@@ -17,12 +17,13 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Block, Section, Subject, svg_figure
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
-from marsyard.reports.wording import magnitude_label, note_text
+from marsyard.reports.wording import format_fraction, magnitude_label, note_text
 
 #: A logarithmic axis with a smaller ratio of maximum to minimum also has ticks at 2 and 5.
 _MAX_TICK_RATIO = 50
 #: Number of points of a convergence curve, spaced logarithmically, and the minimum number of cases.
 MAX_POINTS, MIN_CASES = 12, 8
+#: Quantile of the errors.
 QUANTILE = 0.95
 
 
@@ -36,23 +37,30 @@ class Point:
     upper: float
 
 
+@dataclass(frozen=True)
+class Curve:
+    """A quantity against the number of cases, with its name in captions, label of its axis, and required value."""
+
+    name: str
+    axis_label: str
+    points: Sequence[Point]
+    required: float | None = None
+
+
 def convergence_section(subject: Subject) -> Section | None:
     """Plot success rates, mean and 95 % quantile of the errors against the number of cases; None below 16 cases."""
     frame = subject.all_cases
     if len(frame) < 2 * MIN_CASES:
         return None
-    curves = success_rate_curves(subject)
+    rate_curves = success_rate_curves(subject)
     svg_figures = [
-        svg_figure(
-            curve_figure(points, "success rate", rate), f"converge{index}", f"{name}: success rate and its bounds."
-        )
-        for index, (name, rate, points) in enumerate(curves)
+        svg_figure(curve_figure(curve), f"converge{index}", f"{curve.name}: success rate and its bounds.")
+        for index, curve in enumerate(rate_curves)
     ]
-    data = {name: points for name, _, points in curves}
-    for key, (name, axis, points) in error_curves(frame, subject.metric).items():
-        bound = subject.bound if key == "quantile" else None
-        svg_figures.append(svg_figure(curve_figure(points, axis, bound), f"converge-{key}", f"{name} and its bounds."))
-        data[f"{subject.metric}: {name}"] = points
+    data = {curve.name: curve.points for curve in rate_curves}
+    for key, curve in error_curves(frame, subject.metric, subject.bound).items():
+        svg_figures.append(svg_figure(curve_figure(curve), f"converge-{key}", f"{curve.name} and its bounds."))
+        data[f"{subject.metric}: {curve.name}"] = curve.points
     if not svg_figures:
         return None
     note = note_text("common.convergence")
@@ -70,26 +78,27 @@ def curve_sizes(cases: int) -> list[int]:
     return sorted({round(float(size)) for size in np.geomspace(MIN_CASES, cases, MAX_POINTS)})
 
 
-def success_rate_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
-    """Return name, required rate and convergence curve of each requirement that can be evaluated."""
+def success_rate_curves(subject: Subject) -> list[Curve]:
+    """Compute the success rate of each requirement that can be evaluated, from the first n cases."""
     sampling = read_sampling_design(subject.run.definition)
     frame, requirements = subject.all_cases, subject.run.requirements
     sizes = curve_sizes(len(frame))
     evaluated = [(size, evaluate_requirements(frame.head(size), requirements, sampling)) for size in sizes]
+    _, final_verdicts = evaluated[-1]
     curves = []
-    for index, final in enumerate(evaluated[-1][1]):
+    for index, final in enumerate(final_verdicts):
         points = [
             Point(size, verdicts[index].estimate, verdicts[index].lower, verdicts[index].upper)
             for size, verdicts in evaluated
             if not math.isnan(verdicts[index].estimate)
         ]
         if len(points) > 1:
-            curves.append((final.requirement_id, final.probability, points))
+            curves.append(Curve(final.requirement_id, "success rate", points, final.probability))
     return curves
 
 
-def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str, str, list[Point]]]:
-    """Return name, axis label and points of mean and 95 % quantile of the first n errors; empty for too few cases."""
+def error_curves(frame: pd.DataFrame, metric: str | None, bound: float | None) -> dict[str, Curve]:
+    """Compute `mean` and `quantile` of the first n errors; empty for too few cases."""
     if metric is None:
         return {}
     magnitude, groups = np.abs(numbers(frame, metric)), rates.terrain_groups(frame)
@@ -103,18 +112,19 @@ def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str
             quantiles.append(Point(size, float(np.quantile(values, QUANTILE)), *bounds))
     if len(quantiles) < 2:
         return {}
-    name = magnitude_label(metric)
+    name, quantile = magnitude_label(metric), format_fraction(QUANTILE)
     return {
-        "mean": ("Mean of the errors", f"mean of {name}", means),
-        "quantile": ("95 % quantile of the errors", f"95 % of {name}", quantiles),
+        "mean": Curve("Mean of the errors", f"mean of {name}", means),
+        "quantile": Curve(f"{quantile} quantile of the errors", f"{quantile} of {name}", quantiles, bound),
     }
 
 
 @in_page_style
-def curve_figure(points: Sequence[Point], name: str, required: float | None) -> Figure:
+def curve_figure(curve: Curve) -> Figure:
     """Draw an estimate and its bounds against the number of cases."""
     figure, axes = new_axes(4.2, 2.8)
-    cases, estimates, lower, upper = np.array([astuple(point) for point in points]).T
+    cases, estimates, lower, upper = np.array([astuple(point) for point in curve.points]).T
+    required = curve.required
     values = np.concatenate([estimates, lower, upper, [math.nan if required is None else required]])
     values = values[np.isfinite(values)]
     if values.size:
@@ -129,7 +139,7 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
     axes.plot(cases, estimates, color=SERIES[0], marker="o", markersize=3.5)
     if required is not None and math.isfinite(required):
         axes.axhline(required, color=REQUIREMENT, linewidth=1.4, linestyle="--")
-    axes.set(xscale="log", xlabel="cases", ylabel=name)
+    axes.set(xscale="log", xlabel="cases", ylabel=curve.axis_label)
     if cases[-1] < _MAX_TICK_RATIO * cases[0]:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Int
 
 from marsyard.reports import populations, rates
 from marsyard.reports.bounds import Looks, add_clustered_bounds, add_independent_bounds
@@ -18,7 +19,7 @@ from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.sequential import SequentialTest
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, AllCases, Status, Verdict, min_cases_for_rate
-from marsyard.reports.wording import count
+from marsyard.reports.wording import count, plain_value
 
 
 def _add_bounds(verdict: Verdict, evidence: CaseEvidence, looks: Looks) -> Verdict:
@@ -126,9 +127,17 @@ def _case_evidence(
     groups = rates.terrain_groups(frame) if member.size else None
     if groups is None or has_own_terrains:
         return CaseEvidence(success, member, groups, in_first_look)
+    return CaseEvidence(success, member, groups, in_first_look, _label_terrains(frame, groups))
+
+
+def _label_terrains(frame: pd.DataFrame, groups: Int[np.ndarray, " n"]) -> tuple[str, ...]:
+    """Return a label for each terrain (index in `groups`), equal for equal terrains of other confirmations."""
     first_rows = np.unique(groups, return_index=True)[1]
-    labels = tuple(f"terrain {value}" for value in frame["terrain"].iloc[first_rows])
-    return CaseEvidence(success, member, groups, in_first_look, labels)
+    # a column with a missing terrain contains floating-point numbers: the labels have no decimals
+    return tuple(
+        f"unknown terrain of row {row}" if pd.isna(terrain) else f"terrain {plain_value(terrain)}"
+        for row, terrain in zip(first_rows.tolist(), frame["terrain"].iloc[first_rows], strict=True)
+    )
 
 
 def _evaluate(
@@ -137,6 +146,10 @@ def _evaluate(
     sampling: SamplingDesign,
     earlier: RequirementEvidence | None = None,
 ) -> Verdict:
+    """Evaluate a requirement; INSUFFICIENT with a reason if the rows do not allow it, or no case is in its population.
+
+    earlier: evidence of other confirmations of the same claim
+    """
     verdict = _empty_verdict(requirement)
     frame = _complete_columns(frame, verdict)
     problem = _describe_problem(frame, verdict)
@@ -153,16 +166,17 @@ def _evaluate(
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, additional_cases=needed_cases if sampling.independent else None)
     has_own_terrains = earlier is None or earlier.population.labels is None
-    own = [
+    population, with_unfinished = (
         _case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains)
         for mask in (members, members_and_unfinished)
-    ]
-    earlier_parts = () if earlier is None else (earlier.population, earlier.with_unfinished)
-    joined = [part.join_own(own_part) for part, own_part in zip(earlier_parts, own, strict=True)] if earlier else own
-    decided = _decide(verdict, joined[0], sampling, frame)
+    )
+    if earlier is not None:
+        population = earlier.population.join_own(population)
+        with_unfinished = earlier.with_unfinished.join_own(with_unfinished)
+    decided = _decide(verdict, population, sampling, frame)
     if earlier is None and (members == members_and_unfinished).all():
         return decided
-    return _withhold_if_uncertain(decided, _decide(verdict, joined[1], sampling, frame))
+    return _withhold_if_uncertain(decided, _decide(verdict, with_unfinished, sampling, frame))
 
 
 def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdict:

@@ -41,7 +41,11 @@ _TAIL_NODE, _MAX_TAIL_FRACTION = 7.0, 0.01
 
 
 class ChangeKind(StrEnum):
-    """ChangeKind of a change, see above; VALUE: another value of a parameter that the campaign does not disperse."""
+    """Kind of a change, see above.
+
+    DIVERGENCE: any change of all dispersions at once, by its Kullback-Leibler divergence
+    (`marsyard.reports.robustness_evaluation`). VALUE: another value of a parameter that the campaign does not disperse.
+    """
 
     MEAN_UP = "mean up"
     MEAN_DOWN = "mean down"
@@ -144,7 +148,11 @@ def sign_of(kind: ChangeKind) -> float:
 
 
 def list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[Change]:
-    """List the changes of a dispersion up to those whose expected number of effective cases is 30."""
+    """List the changes of a dispersion with the standard normal variables z of the cases.
+
+    Changes of mean and standard deviation end where the expected number of effective cases is 30; those of a value of
+    `choice` end at the probability 1.
+    """
     steps, fraction = np.linspace(0.0, 1.0, _STEPS), MIN_EFFECTIVE / z.size
     if fraction >= 1.0:
         return

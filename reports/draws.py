@@ -20,15 +20,19 @@ from marsyard.reports.statistics.drivers import rank_correlation
 from marsyard.reports.wording import count
 from marsyard.scenarios.columns import split_unit
 
-#: Width and height of the panel of one distribution, height of a heading and margin of the figure, inches; number of
-#: panels that always fit in a row.
-_WIDTH_IN, _HEIGHT_IN, _HEADING_HEIGHT_IN, _MARGIN_IN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
+#: Width and height of the panel of one distribution, inches, and number of panels that always fit in a row.
+_WIDTH_IN, _HEIGHT_IN, _MIN_PER_ROW = 3.0, 1.9, 4
+#: Margins between the axes and the edges of their panel, which contain tick labels and title, inches.
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.3, 0.25, 0.45, 0.4
+#: Height of a heading, and margin of the figure, inches.
+_HEADING_HEIGHT_IN, _MARGIN_IN = 0.45, 0.15
 #: Side of the panel of two parameters, inches, and maximum number of parameters that are drawn in pairs.
 _CELL_SIDE_IN, MAX_PAIRED = 0.95, 24
 _CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
-#: Maximum number of bars with labels; maximum number of histogram bins.
-_MAX_LABELS, _BINS = 8, 24
-
+#: Numbers of at most this many values, all with few decimals, have a bar for each value, not a histogram.
+_MAX_LEVELS = 12
+#: Maximum number of bars with labels, and of characters of a label; maximum number of histogram bins.
+_MAX_LABELS, _MAX_LABEL_LENGTH, _MAX_BINS = 8, 14, 24
 
 Values = Float[np.ndarray, " _"]
 
@@ -64,8 +68,8 @@ class ParameterSample:
             return None
         return list(dict.fromkeys(_format_value(value) for value in [*(self.expected or ()), *self.values]))
 
-    def numbers(self, values: Sequence[Any]) -> Values:
-        """Convert values to numbers; categories to their index."""
+    def to_numbers(self, values: Sequence[Any]) -> Values:
+        """Convert values of this parameter to numbers; categories to their index."""
         categories = self.categories
         if categories is None:
             return np.array([float(value) for value in values])
@@ -75,7 +79,7 @@ class ParameterSample:
 @in_page_style
 def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     """Draw the marginal distributions of at least one parameter, and below them all pairs of parameters that vary."""
-    pair_samples = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1]
+    pair_samples = [sample for sample in samples if len(set(sample.to_numbers(sample.values).tolist())) > 1]
     pair_samples = pair_samples[:MAX_PAIRED]
     pairs_side = len(pair_samples) * _CELL_SIDE_IN if len(pair_samples) > 1 else 0.0
     width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, pairs_side, 2.0 * _WIDTH_IN)
@@ -89,9 +93,9 @@ def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     _write_heading(figure, upper_height + lower_height, heading)
     for index, sample in enumerate(samples):
         row, column = divmod(index, n_columns)
-        # the margins around the axes contain the title and the tick labels
-        corner = (_MARGIN_IN + column * width / n_columns + 0.3, lower_height + (n_rows - 1 - row) * _HEIGHT_IN + 0.45)
-        _draw_marginal(_add_axes(figure, corner, (width / n_columns - 0.55, _HEIGHT_IN - 0.85)), sample)
+        left, bottom = _MARGIN_IN + column * width / n_columns, lower_height + (n_rows - 1 - row) * _HEIGHT_IN
+        size = width / n_columns - _LEFT_IN - _RIGHT_IN, _HEIGHT_IN - _BOTTOM_IN - _TOP_IN
+        _draw_marginal(_add_axes(figure, (left + _LEFT_IN, bottom + _BOTTOM_IN), size), sample)
     if pairs_side:
         _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
         left = _MARGIN_IN + 0.5 * (width - pairs_side)
@@ -116,12 +120,14 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
-    categories, values = sample.categories, sample.numbers(sample.values)
-    expected = None if sample.expected is None else sample.numbers(sample.expected)
+    """Draw the distribution of a parameter, and the expected one."""
+    categories, values = sample.categories, sample.to_numbers(sample.values)
+    expected = None if sample.expected is None else sample.to_numbers(sample.expected)
     all_values = values if expected is None else np.concatenate([values, expected])
     levels = np.unique(all_values)
-    # categories and few round numbers as bars, other numbers as a histogram with about 1.5 sqrt(n) bins
-    if categories is not None or (levels.size <= 12 and np.all(levels == np.round(levels, 9))):
+    are_round = levels.size <= _MAX_LEVELS and np.all(levels == np.round(levels, 9))
+    # categories, constants and few round numbers as bars, other numbers as a histogram with about 1.5 sqrt(n) bins
+    if categories is not None or levels.size == 1 or are_round:
         positions = np.arange(levels.size)
         axes.bar(positions, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
         if expected is not None:
@@ -129,11 +135,10 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
             axes.plot(positions, heights, linestyle="none", marker="_", markersize=14, color=INK, markeredgewidth=1.6)
         names = [f"{level:g}" if categories is None else categories[int(level)] for level in levels]
         if len(names) <= _MAX_LABELS:
-            axes.set_xticks(positions, [name if len(name) <= 14 else f"{name[:13]}…" for name in names])
+            axes.set_xticks(positions, [_shorten(name) for name in names])
     else:
-        edges = np.linspace(
-            all_values.min(), all_values.max(), min(_BINS, max(5, int(math.sqrt(values.size) * 1.5))) + 1
-        )
+        n_bins = min(_MAX_BINS, max(5, int(math.sqrt(values.size) * 1.5)))
+        edges = np.linspace(all_values.min(), all_values.max(), n_bins + 1)
         axes.hist(values, bins=edges.tolist(), color=SERIES[0], alpha=0.85)
         if expected is not None:
             counts = np.histogram(expected, bins=edges)[0] * (values.size / expected.size)
@@ -147,7 +152,7 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
 def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
     """Draw pairs of parameters: scatter in the lower left, rank correlations in the upper right."""
     n = len(samples)
-    numbers = [sample.numbers(sample.values) for sample in samples]
+    numbers = [sample.to_numbers(sample.values) for sample in samples]
     # each value is scaled to its cell of side 1, with margins of 0.08
     scaled = [0.08 + 0.84 * (values - values.min()) / np.ptp(values) for values in numbers]
     pairs = [(row, column) for row in range(n) for column in range(row)]
@@ -171,6 +176,11 @@ def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
         axes.text(row + 0.5, column + 0.5, text, fontsize=8, **style)
     axes.set(xlim=(0, n), ylim=(n, 0))
     axes.set_axis_off()
+
+
+def _shorten(name: str) -> str:
+    """Shorten a label to `_MAX_LABEL_LENGTH` characters."""
+    return name if len(name) <= _MAX_LABEL_LENGTH else f"{name[: _MAX_LABEL_LENGTH - 1]}…"
 
 
 def _format_value(value: Any) -> str:

@@ -35,7 +35,9 @@ class Effect:
 def estimate_effects(frame: pd.DataFrame, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[Effect]:
     """Compute the effect of every condition `x` that varies on every response `y`."""
     effects, groups = [], rates.terrain_groups(frame)
-    for condition in (condition for condition in x if varies(frame, condition.column)):
+    for condition in x:
+        if not varies(frame, condition.column):
+            continue
         for response in y:
             conditions, responses = condition.values(frame), response.values(frame)
             bins = condition_bins(np.where(np.isfinite(responses), conditions, np.nan))

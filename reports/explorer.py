@@ -82,14 +82,15 @@ def explorer_data(
         values = numbers(points, name) if name in points else numbers(complete, name)
         return [float(f"{value:.4g}") if math.isfinite(value) else None for value in values]
 
-    metric_index, other = names.index(metric), names.index((drivers or [metric])[0])
-    first_axes = [names.index(name) for name in components] if len(components) == 2 else [other, metric_index]
+    metric_index, condition_index = names.index(metric), names.index(drivers[0] if drivers else metric)
+    second_axes = [condition_index, metric_index]
+    first_axes = [names.index(name) for name in components] if len(components) == 2 else second_axes
     return {
         "labels": [label(name) for name in names],
         "columns": [column_values(name) for name in names],
         "metric": metric_index,
         "parts": [names.index(component) for component in components] if len(components) == 2 else [],
-        "axes": [first_axes, [other, metric_index]],
+        "axes": [first_axes, second_axes],
         "requirements": [
             {
                 "name": item.name,

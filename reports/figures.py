@@ -32,6 +32,11 @@ ELLIPSE = 0.95
 _MIN_BOUND_FRACTION = 0.6
 #: Number of cases per point of the curves of median and 95 % quantile; minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
+#: Number of steps of a distribution; more cannot be distinguished.
+_MAX_STEPS = 2000
+#: Positions of marks above the largest magnitude drawn to scale, relative to it: hollow markers of errors beyond the
+#: axis, and at the upper edge of the axes strokes of cases without an error.
+_HOLLOW_POSITION, _TOP = 1.06, 1.12
 _LEGEND_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
 
 
@@ -55,7 +60,8 @@ def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Ca
     elif bound is not None:
         magnitude = np.abs(numbers(frame, metric))
         pairs = [("within the bound", magnitude <= bound), ("beyond the bound", magnitude > bound)]
-        names, masks = [name for name, mask in pairs if mask.any()], [mask for _, mask in pairs if mask.any()]
+        pairs = [(name, mask) for name, mask in pairs if mask.any()]
+        names, masks = [name for name, _ in pairs], [mask for _, mask in pairs]
     else:
         names, masks = ["cases"], [np.ones(len(frame), dtype=np.bool_)]
     return [CaseCategory(name, masks[index], SERIES[index], MARKERS[index]) for index, name in enumerate(names)]
@@ -129,7 +135,7 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     axes.hist(on_axis, bins=list(bins), color=SERIES[0], alpha=0.85)
     n_beyond = magnitude.size - on_axis.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
-    if n_beyond:  # a hatched bar beyond the axis
+    if n_beyond:  # a hatched bar beyond the axis, separated by a line; positions are relative to the end of the axis
         axes.bar(1.11 * edge, n_beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
         axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
         text, position = f"{n_beyond:,}\n> {edge:.3g}", (1.11 * edge, n_beyond)
@@ -150,8 +156,8 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
         return None
     figure, axes = new_axes(5.0, 2.7)
     ordered = np.sort(magnitude)
-    if ordered.size > 2000:  # more steps cannot be distinguished
-        ordered = np.quantile(ordered, np.linspace(0.0, 1.0, 2000))
+    if ordered.size > _MAX_STEPS:
+        ordered = np.quantile(ordered, np.linspace(0.0, 1.0, _MAX_STEPS))
     fraction = np.arange(1, ordered.size + 1) / ordered.size
     steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
     axes.plot(steps, np.concatenate([[0.0], fraction, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
@@ -162,6 +168,7 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     return figure
 
 
+@in_page_style
 def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, bound: float | None) -> Figure | None:
     """Draw errors against a condition (a column); None without cases that have a number for the condition.
 
@@ -175,18 +182,18 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, boun
         return None
     figure, axes = new_axes(4.2, 3.2)
     edge = _scatter_edge(magnitude[finite], bound)
-    top = 1.12 * edge  # position of the vertical strokes; hollow markers are at 1.06 * edge
+    hollow_position, top = _HOLLOW_POSITION * edge, _TOP * edge
     groups = categories(frame, metric, bound)
     for group in groups:
         on_axis, beyond_axis = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
         _draw_points(axes, x[on_axis], magnitude[on_axis], group)
-        _draw_points(axes, x[beyond_axis], np.full(beyond_axis.sum(), 1.06 * edge), group, hollow=True)
+        _draw_points(axes, x[beyond_axis], np.full(beyond_axis.sum(), hollow_position), group, hollow=True)
     if len(groups) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_LEGEND_BELOW)
     bins = min(int(finite.sum()) // _CASES_PER_POINT, _MAX_POINTS)
     if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins with equal numbers of cases
-        finite_x, limited_magnitude = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
+        finite_x, limited_magnitude = x[finite], np.minimum(magnitude[finite], hollow_position)
         bin_indices = np.array_split(np.argsort(finite_x, kind="stable"), bins)
         centres = [float(np.median(finite_x[indices])) for indices in bin_indices]
         for quantile, line in ((0.5, "-"), (0.95, ":")):
@@ -206,7 +213,7 @@ def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> f
     """Compute the largest magnitude drawn to scale; the axis includes the bound if the errors approach the bound."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
-    includes_bound = bound is not None and 1.12 * largest > _MIN_BOUND_FRACTION * bound
+    includes_bound = bound is not None and _TOP * largest > _MIN_BOUND_FRACTION * bound
     return edge if includes_bound or largest == 0.0 else largest
 
 

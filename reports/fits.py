@@ -11,7 +11,7 @@ REGISTER = Path(__file__).with_name("fitted.toml")
 
 
 @dataclass(frozen=True)
-class Data:
+class FittedData:
     """Data to which constants were fitted: key, title, and source."""
 
     key: str
@@ -33,7 +33,7 @@ class Constant:
 
     where: str
     value: float
-    data: Data
+    data: FittedData
     quantity: str
     seeds: str
     systems: tuple[str, ...]
@@ -41,7 +41,7 @@ class Constant:
 
     @property
     def name(self) -> str:
-        """Last name of its place."""
+        """Last part of `where`: the name of the parameter, constant or field."""
         return self.where.rpartition(":")[2].rpartition(".")[2]
 
     def concerns(self, system: str, sites: Collection[str]) -> bool:
@@ -61,11 +61,11 @@ def read_constants(path: Path) -> tuple[Constant, ...]:
 
 
 def _read_constants(content: Mapping[str, Any]) -> Iterator[Constant]:
-    data = {key: Data(key, **values) for key, values in content["data"].items()}
+    data = {key: FittedData(key, **values) for key, values in content["data"].items()}
     for fit in content["fits"]:
-        names = tuple(fit["systems"]), tuple(fit.get("sites", ()))
+        systems, sites = tuple(fit["systems"]), tuple(fit.get("sites", ()))
         for where, value in fit["constants"].items():
-            yield Constant(where, value, data[fit["data"]], fit["quantity"], fit["seeds"], *names)
+            yield Constant(where, value, data[fit["data"]], fit["quantity"], fit["seeds"], systems, sites)
 
 
 def fitted_data() -> frozenset[str]:

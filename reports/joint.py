@@ -126,15 +126,21 @@ def read_joint_evidence(evidence: Evidence) -> JointEvidence:
     try:
         record = read_record(path)
     except StoreError as error:
-        return JointEvidence(True, f"{UNKNOWN}: {error}.")
+        return JointEvidence(is_confirmation=True, registration_problem=f"{UNKNOWN}: {error}.")
     registration = find_registration_problem(path)
     own = find_own_entry(record, evidence)
     if own is None:
-        return JointEvidence(True, registration or f"{UNKNOWN}: {path} does not contain this run.")
+        problem = registration or f"{UNKNOWN}: {path} does not contain this run."
+        return JointEvidence(is_confirmation=True, registration_problem=problem)
     entries = record.of_claim(own.claim)
     others = [entry for entry in entries if entry.number != own.number]
-    related = list_related_claims(record, entries)
-    return JointEvidence(True, evidence.registration or registration, own, others, related)
+    return JointEvidence(
+        is_confirmation=True,
+        registration_problem=evidence.registration or registration,
+        own=own,
+        others=others,
+        related=list_related_claims(record, entries),
+    )
 
 
 def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdict:

@@ -1,4 +1,7 @@
-"""Verdict of a campaign with several requirements: overall verdict, exit status, and what would decide it."""
+"""Verdict of a campaign with several requirements: overall verdict, exit status, and joint risk of false PASSes.
+
+An undecided campaign also has a remedy: the additional cases that would decide it.
+"""
 
 import math
 from collections.abc import Sequence
@@ -145,9 +148,8 @@ def combine_verdicts(
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     worst_count, total = statuses.count(worst), count(len(statuses), "requirement")
     fraction = f"{worst_count} of {total}"
-    subject = (
-        "the requirement" if len(statuses) == 1 else f"any of the {total}" if worst_count == len(statuses) else fraction
-    )
+    undecided = fraction if worst_count < len(statuses) else f"any of the {total}"
+    undecided = "the requirement" if len(statuses) == 1 else undecided
     n_undecided = statuses.count(Status.INSUFFICIENT)
     undecided_text = f", {n_undecided} undecided" if n_undecided else ""
     remedy = find_remedy(verdicts, len(frame))
@@ -158,7 +160,7 @@ def combine_verdicts(
         Status.UNREGISTERED: f"{fraction} met, but no registered record shows the earlier runs.",
         Status.OTHER_CLAIMS: f"{fraction} met, after other claims about this campaign that did not pass.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{remedy_text}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {undecided}.{remedy_text}",
     }[worst]
     is_exploration = evidence is not None and evidence.kind is EvidenceKind.EXPLORATION
     additional_cases = remedy.cases if worst is Status.INSUFFICIENT and sampling.max_cases is None else None

@@ -99,20 +99,22 @@ def dispersion_grid(run: StoredRun) -> Grid:
     model = scenario(scenario_name).parameters_type if scenario_name in scenario_names() else None
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, path_parts = table(entry), str(path).split(".")
-        statistics = [NOTHING] * 3
+        minimum, mean, maximum = [NOTHING] * 3
         if path in run.frame:
             values = pd.to_numeric(run.frame[path], errors="coerce").dropna()
-            statistics[1] = f"{run.frame[path].nunique()} values"
+            mean = f"{run.frame[path].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[path].dtype):
-                statistics = [format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
+                minimum, mean, maximum = (
+                    format_value(float(value)) for value in (values.min(), values.mean(), values.max())
+                )
                 if path_parts[-1] == "terrain":
-                    statistics[1] = NOTHING  # the mean of numbers of terrains has no meaning
+                    mean = NOTHING  # the mean of numbers of terrains has no meaning
         # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
         meaning, unit = meaning.split(";")[0], split_unit(path_parts[-1])[1]
         meaning += f" ({unit})" if unit and not meaning.endswith(f", {unit}") else ""
         source = str(dispersion.get("source") or NOTHING)
-        rows.append([meaning, str(path), _distribution_text(dispersion), *statistics, source])
+        rows.append([meaning, str(path), _distribution_text(dispersion), minimum, mean, maximum, source])
     return Grid(["Quantity", "Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
 
 
@@ -141,7 +143,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         bounds_text = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} observed"
     else:
         lowest = min(verdict.lower, verdict.probability)
-        # the scale starts below the lower bound and the required rate, and ends at 100 %
+        # the scale ends at 100 %; up to a fifth of it lies below the lower bound and the required rate
         scale_start = max(0.0, lowest - 0.25 * (1.0 - lowest))
         rates = {"estimate": verdict.estimate, "required": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
@@ -179,7 +181,11 @@ def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
 def page_context(
     run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
 ) -> dict[str, Any]:
-    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases."""
+    """Create the context of the page's template.
+
+    run: all cases; the subject contains only the random ones, to which statistics, dispersions and figures refer
+    extra: sections in addition to those that the template contains
+    """
     metric, bound = subject.metric, subject.bound
     crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
     cautions = [crash_text] if overall.crashed else []
@@ -215,24 +221,36 @@ def page_context(
         "replay": provenance.replay_command(run, "CASE"),
         "gallery_command": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
-    cases_with_images = [str(case.case) for case in gallery]
+    return context | _error_context(subject, finder, [str(case.case) for case in gallery])
+
+
+def _error_context(subject: Subject, finder: CaseFinder, cases_with_images: Sequence[str]) -> dict[str, Any]:
+    """Create the part of the context about the errors of the page's metric; without contents if there is no metric."""
+    run, metric, bound = subject.run, subject.metric, subject.bound
     if metric is None:
-        empty_table = tables.CaseTable((), ())
-        context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
-        return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
-    context["explorer"], random_run = None, subject.run
-    if np.isfinite(numbers(random_run.frame, metric)).any():
-        data = explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images)
+        no_cases = tables.CaseTable((), ())
+        context: dict[str, Any] = {
+            "explorer": None,
+            "error_figures": [],
+            "driver_figures": [],
+            "statistics": Grid((), ()),
+        }
+        return context | {"worst": no_cases, "unanswered": no_cases}
+    explorer_context = None
+    if np.isfinite(numbers(run.frame, metric)).any():
+        data = explorer.explorer_data(run, metric, finder.explored_requirements(), cases_with_images)
         script = explorer.read_script()
-        context["explorer"] = {"data": data, "script": script} | {
-            "json": page_environment.embed_json(data), "hash": page_environment.script_hash(script),
+        explorer_context = {
+            "data": data, "json": page_environment.embed_json(data),
+            "script": script, "hash": page_environment.script_hash(script),
         }  # fmt: skip
-    return context | {
-        "error_figures": error_figures(random_run.frame, random_run.all_cases, metric, bound),
-        "driver_figures": driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
-        "statistics": statistics_grid(random_run.all_cases, metric),
-        "worst": tables.worst_cases(random_run, metric, cases_with_images),
-        "unanswered": tables.unanswered_cases(random_run, metric, cases_with_images),
+    return {
+        "explorer": explorer_context,
+        "error_figures": error_figures(run.frame, run.all_cases, metric, bound),
+        "driver_figures": driver_figures(run.frame, metric, bound, run.driver_columns(metric)),
+        "statistics": statistics_grid(run.all_cases, metric),
+        "worst": tables.worst_cases(run, metric, cases_with_images),
+        "unanswered": tables.unanswered_cases(run, metric, cases_with_images),
     }
 
 

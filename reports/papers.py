@@ -14,6 +14,10 @@ from marsyard.reports.rates import finite_values, flag_fraction, fraction_text, 
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.wording import NOTHING
 
+_VALUES_NOTE = (
+    '"Ours" is the median over all cases, with minimum to maximum in brackets. A dash means that no value is printed.'
+)
+
 
 @cache
 def read_paper(path: Path) -> Mapping[str, Any]:
@@ -44,11 +48,6 @@ def paper_section(subject: Subject, path: Path, *extra_blocks: Block) -> Section
     grid = Grid(["", "Paper", "Ours"], [[name, *fact.values()] for name, fact in data.items()])
     block = Block(grid=grid, note=f"{_VALUES_NOTE} {facts.get('note', '')}".strip(), data=data)
     return create_section("paper", "Paper comparison", facts["title"], block, *extra_blocks)
-
-
-_VALUES_NOTE = (
-    '"Ours" is the median over all cases, with minimum to maximum in brackets. A dash means that no value is printed.'
-)
 
 
 def format_simulated_value(frame: pd.DataFrame, row: Mapping[str, Any]) -> str:

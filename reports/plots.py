@@ -18,9 +18,9 @@ from marsyard.reports.wording import count as count_text
 _MAX_EDGE_RATIO = 3.0
 #: If more than this fraction of the errors exceeds `_MAX_EDGE_RATIO` times the bound, the axis ends at this quantile.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
-_BELOW_AXES: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+_LEGEND_BELOW_AXES: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+_LINE_STYLES = ("-", "--", ":", "-.")
 Values = Float[np.ndarray, " n"]
-_LINES = ("-", "--", ":", "-.")
 
 
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
@@ -63,7 +63,7 @@ def cumulative_figure(
     figure, axes = new_axes(6.4, 3.4)
     all_values = np.concatenate([*curves.values()])
     edge = None if bound is None else max(1.25 * bound, axis_edge(all_values, bound))
-    for (name, values), colour, line in zip(curves.items(), SERIES, _LINES * 2, strict=False):
+    for (name, values), colour, line in zip(curves.items(), SERIES, _LINE_STYLES * 2, strict=False):
         if values.size:
             x, fraction = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
             if edge is not None:
@@ -80,7 +80,7 @@ def cumulative_figure(
         axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
         axes.set_xlim(0.0, 1.02 * edge)
         note_beyond(axes, int((all_values > edge).sum()))
-    axes.legend(**_BELOW_AXES)
+    axes.legend(**_LEGEND_BELOW_AXES)
     return figure
 
 
@@ -119,7 +119,7 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
     if limit is not None:
         axes.axvline(limit[1], color=REQUIREMENT, linestyle="--", linewidth=1.2, label=limit[0])
     axes.set(xlabel=labels[0], ylabel=labels[1])
-    axes.legend(**_BELOW_AXES)
+    axes.legend(**_LEGEND_BELOW_AXES)
     return figure
 
 
@@ -146,12 +146,12 @@ Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 @in_page_style
 def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool) -> Figure:
     """Draw panels with cases and medians of bins, by x and y labels: a row for each y, a column for each x."""
-    columns, rows = (list(dict.fromkeys(pair[index] for pair in panels)) for index in (0, 1))
-    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
+    x_labels, y_labels = list(dict.fromkeys(x for x, _ in panels)), list(dict.fromkeys(y for _, y in panels))
+    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(y_labels))
     figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
+    grid = figure.subplots(len(y_labels), len(x_labels), squeeze=False, sharex="col", sharey="row")
     for (x, y), (points, medians) in panels.items():
-        axes = grid[rows.index(y), columns.index(x)]
+        axes = grid[y_labels.index(y), x_labels.index(x)]
         axes.plot(*points, ".", color=SERIES[5], markersize=3, rasterized=True)
         axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
@@ -160,9 +160,9 @@ def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, l
             # the page's style does not support superscripts of powers of ten
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
-        if y == rows[-1]:
+        if y == y_labels[-1]:
             axes.set_xlabel(x, fontsize=8)
-        if x == columns[0]:
+        if x == x_labels[0]:
             # the unit has its own line, so that labels of adjacent panels do not overlap
             axes.set_ylabel(y.replace(" (", "\n("), fontsize=8)
     return figure

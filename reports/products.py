@@ -56,7 +56,8 @@ def read_arrays(
 
 #: Size of thumbnails, pixels, and their JPEG quality.
 _THUMBNAIL_PX, _THUMBNAIL_QUALITY = 96, 70
-#: Minimum size of an image, pixels. An image that is wider by a larger ratio than this has summed rows.
+#: Minimum size of an image, pixels. From this ratio of its sides, an image has binned rows or columns: it is scaled to
+#: a square, not cropped.
 _MIN_IMAGE_PX, _MAX_ASPECT = 48, 2.0
 
 

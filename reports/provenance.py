@@ -131,7 +131,8 @@ def rerun_commands(run: StoredRun) -> list[str]:
             if run.recorded(key) is not None:
                 words += [option, str(run.recorded(key))]
         return [shlex.join(words)]
-    folder, words = hide_folders(run.command[0]), list(run.command[1])
+    stored_folder, stored_words = run.command
+    folder, words = hide_folders(stored_folder), list(stored_words)
     stored_blocks = run.definition.get("appended")
     # a sequential campaign appends blocks of cases without a command
     block_sizes = [] if run.recorded("max_cases") or not isinstance(stored_blocks, list | tuple) else stored_blocks

@@ -1,4 +1,4 @@
-"""Rates and statistics of rows: fractions with confidence intervals, pooled rates, quantiles, and their texts."""
+"""Rates and statistics of rows: fractions with confidence intervals, pooled rates, quantiles, groups, and texts."""
 
 import math
 from collections.abc import Iterator
@@ -195,11 +195,14 @@ def rate_text(rate: PooledRate) -> str:
 
 
 def median_text(values: Float[np.ndarray, " n"], digits: int | None) -> str:
-    """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values."""
+    """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values.
+
+    digits: number of decimals; None for those of `number`
+    """
     if values.size == 0:
         return NOTHING
-    low, median, high = (float(value) for value in (values.min(), np.median(values), values.max()))
-    texts = [
-        number(value) if digits is None else f"{value:.{digits}f}".replace("-", "−") for value in (median, low, high)
-    ]
-    return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    low, median, high = (
+        number(float(value)) if digits is None else f"{value:.{digits}f}".replace("-", "−")
+        for value in (values.min(), np.median(values), values.max())
+    )
+    return median if low == high else f"{median} ({low} to {high})"

@@ -18,7 +18,7 @@ from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.products import thumbnail
-from marsyard.reports.section import Grid, build_grid
+from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, label, number, percent
@@ -151,8 +151,9 @@ class CaseFinder:
         is_violation = np.zeros(len(self._frame), dtype=np.bool_)
         for item in self._evaluated:
             is_violation |= item.margins < 0.0
-        #: Numbers of the cases that violate any requirement, in increasing order.
-        self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if is_violation.any() else []
+        has_numbers = "case" in self._frame
+        #: Numbers of the cases that violate any requirement, in increasing order; empty for rows without numbers.
+        self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if has_numbers else []
 
     def requirement_cases(self) -> list[RequirementCases]:
         """List the cases of each requirement."""
@@ -173,9 +174,12 @@ class CaseFinder:
         return [item.verdict.requirement_id for item in self._evaluated]
 
     def violations(self, requirement_id: str) -> list[int]:
-        """Return the numbers of the cases that violate a requirement, the smallest margin first."""
+        """Return the numbers of the cases that violate a requirement, the smallest margin first.
+
+        Empty for rows without numbers.
+        """
         rows = [item.violations for item in self._evaluated if item.verdict.requirement_id == requirement_id]
-        return [] if not rows else self._frame["case"].iloc[rows[0]].tolist()
+        return self._frame["case"].iloc[rows[0]].tolist() if rows and "case" in self._frame else []
 
     def explored_requirements(self) -> list[ExploredRequirement]:
         """Return the status of all cases by requirement, for the explorer."""
@@ -190,7 +194,9 @@ class CaseFinder:
         ]
 
     def worst_violations(self, max_per_requirement: int) -> list[int]:
-        """Return the worst violations of each requirement, without repetition."""
+        """Return the worst violations of each requirement, without repetition; empty for rows without numbers."""
+        if "case" not in self._frame:
+            return []
         rows = [row for item in self._evaluated for row in item.violations[:max_per_requirement]]
         return list(dict.fromkeys(int(self._frame["case"].iloc[row]) for row in rows))
 
@@ -211,6 +217,7 @@ class CaseFinder:
         return CaseSummary(statuses, self._case_drivers(row), previous, following, similar, len(self._run.frame))
 
     def _list_cases(self, item: _Evaluated) -> RequirementCases:
+        """List the violations of a requirement, and the cases nearest to its limit if its margin is graded."""
         violations = item.violations
         met = np.flatnonzero((item.margins >= 0.0) & np.isfinite(item.margins)) if item.graded else np.zeros(0, int)
         nearest = met[np.argsort(item.margins[met], kind="stable")][:MAX_NEAREST]
@@ -222,6 +229,7 @@ class CaseFinder:
         )
 
     def _listed_case(self, item: _Evaluated, row: int) -> ListedCase:
+        """Describe the case in a row of the table for the list of a requirement."""
         values = self._row(row)
         case, violates = int(values["case"]), bool(item.margins[row] < 0.0)
         cause = self._find_cause(item, values)
@@ -268,15 +276,12 @@ class CaseFinder:
 
     def _unusual_driver(self, row: int) -> str:
         """Name the driver with the most unusual value of a case; empty if no value is unusual."""
-        percentiles = [(self._percentile(column, row), column) for column in self._drivers]
-        known = [
-            (abs(percentile - 0.5), percentile, column)
-            for percentile, column in percentiles
-            if percentile == percentile
-        ]
-        if not known or 2.0 * max(known)[0] < _USUAL:
+        percentiles = {column: self._percentile(column, row) for column in self._drivers}
+        known = {column: percentile for column, percentile in percentiles.items() if not math.isnan(percentile)}
+        column = max(known, key=lambda name: (abs(known[name] - 0.5), known[name], name), default="")
+        if not column or 2.0 * abs(known[column] - 0.5) < _USUAL:
             return ""
-        _, percentile, column = max(known)
+        percentile = known[column]
         unit = split_unit(column)[1]
         value = number(to_float(self._frame[column].iloc[row]))
         fraction, word = (percentile, "lower") if percentile < 0.5 else (1.0 - percentile, "higher")
@@ -316,15 +321,8 @@ class CaseFinder:
             group = str(values.get("outcome", NOTHING)), NOTHING if cause is None else cause.name
             counts[group] += 1
             examples.setdefault(group, int(values["case"]))
-        return build_grid(
-            counts.most_common(),
-            {
-                "Outcome": lambda entry: entry[0][0],
-                "Cause": lambda entry: entry[0][1],
-                "Violations": lambda entry: f"{entry[1]:,}",
-                "Example": lambda entry: f"case {examples[entry[0]]}",
-            },
-        )
+        rows = [[*group, f"{n:,}", f"case {examples[group]}"] for group, n in counts.most_common()]
+        return Grid(["Outcome", "Cause", "Violations", "Example"], rows)
 
 
 def _describe_margin(item: _Evaluated, margin: float) -> tuple[str, str]:

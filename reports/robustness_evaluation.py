@@ -69,11 +69,11 @@ def evaluate_robustness(
     requirements = {str(item.get("id")): item for item in run.requirements}
     # unfinished cases count as failures, also in populations of answers
     evidence = [
-        (item, cases.with_unfinished)
-        for item in met
-        if (cases := collect_evidence(frame, requirements[item.requirement_id], sampling, has_own_terrains=True))
+        (verdict, part.with_unfinished)
+        for verdict in met
+        if (part := collect_evidence(frame, requirements[verdict.requirement_id], sampling, has_own_terrains=True))
     ]
-    records = [_find_divergence(*item) for item in evidence]
+    records = [_find_divergence(verdict, cases) for verdict, cases in evidence]
     if campaign is not None and campaign.drawn_paths:
         case_numbers = frame["case"].to_numpy(dtype=np.int64)
         coordinates = draw_coordinates(campaign, case_numbers)
@@ -82,7 +82,7 @@ def evaluate_robustness(
             for change in list_changes(quantity.dispersion, coordinates[:, index]):
                 if (sizes := quantity.sizes(change)) is not None:
                     scaled = replace(change, sizes=sizes)
-                    records += [_find_change(path, quantity, scaled, *item) for item in evidence]
+                    records += [_find_change(path, quantity, scaled, verdict, cases) for verdict, cases in evidence]
     order = {verdict.requirement_id: index for index, verdict in enumerate(met)}
     return tuple(sorted(records, key=lambda item: (order[item.requirement], sort_key(item))))
 

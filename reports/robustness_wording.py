@@ -108,5 +108,6 @@ def _list_nearest_changes(own: Sequence[Robustness]) -> list[str]:
 def _describe_chance(verdict: Verdict, own: Sequence[Robustness]) -> str:
     """Describe how many changes to FAIL appear by chance among the examined ones; empty for less than one."""
     examined = len(_select_changes(own))
+    # the tolerance is for rounding errors, such as 10 * (1 - 0.9) = 0.9999999999999998
     by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
     return f" (of {examined} examined, of which at most {by_chance} appear by chance on average)" if by_chance else ""

@@ -131,6 +131,7 @@ class SamplingDesign:
 
     def mask_first_look(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
         """Create the mask of the rows that an earlier first look used; None at the first look."""
+        # planned looks (`max_cases`) have fractions of the risk instead
         if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):

@@ -1,4 +1,4 @@
-"""Building blocks of report sections: tables, figures with captions, and blocks."""
+"""Report sections and what they are made of: the subject of a report, blocks, tables, and figures with captions."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

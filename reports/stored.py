@@ -32,8 +32,8 @@ class StoredRun:
 
     - frame: rows with all columns, sorted by case; only the first `FIRST_CASES` rows if the campaign has more than
       `MAX_FULL_CASES` cases
-    - all_cases: rows of all cases; only the columns of verdicts, outcomes, errors and axes of figures if the campaign
-      has more than `MAX_FULL_CASES` cases
+    - all_cases: rows of all cases; only the columns of verdicts, margins, outcomes, errors and axes of figures if the
+      campaign has more than `MAX_FULL_CASES` cases
     - record: contents of `campaign.json`; empty if the file cannot be read
     - stored_cases: numbers of the cases with stored products: first the case that the report shows, then the others in
       increasing order
@@ -180,7 +180,9 @@ def _read_rows(path: Path, run: StoredRun) -> StoredRun:
     columns.update(column.name for column in enabling_columns(stored_names))
     for requirement in run.requirements:
         columns.update(
-            str(requirement.get("metric", "")).split(" + "), str(requirement.get("population", "")).split(" and ")
+            str(requirement.get("metric", "")).split(" + "),
+            str(requirement.get("population", "")).split(" and "),
+            [str(requirement.get("margin", ""))],
         )
     metric = primary_metric(first_rows, run.requirements)
     if metric is not None:

@@ -113,14 +113,15 @@ def _condition_columns(run: StoredRun, metric: str) -> list[str]:
 def _case_table(
     run: StoredRun, order: Int[np.ndarray, " n"], columns: Sequence[str], with_images: Collection[str] = ()
 ) -> CaseTable:
+    """Create the table of the first `_MAX_CASES` rows in an order, with the values of the columns that exist."""
     frame = run.all_cases
     names = [name for name in columns if name in frame]
     rows = []
     for index in order[:_MAX_CASES].tolist():
         case = str(frame["case"].iloc[index]) if "case" in frame else str(index)
         texts = [_cell_text(frame, name, index) for name in ("outcome", *names)]
-        error = _cell_text(frame, "error", index), _cell_text(frame, "traceback", index)
-        rows.append(CaseRow(case, case in with_images, texts, replay_command(run, case), *error))
+        message, trace = _cell_text(frame, "error", index), _cell_text(frame, "traceback", index)
+        rows.append(CaseRow(case, case in with_images, texts, replay_command(run, case), message, trace))
     return CaseTable(["Case", "Outcome", *(label(name) for name in names)], rows, max(0, order.size - _MAX_CASES))
 
 

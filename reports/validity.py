@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -31,10 +31,17 @@ from marsyard.reports.wording import NOTHING, count, note_text, percent
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import System, find_system
 
-#: Kinds of rows that define each domain, and its description.
-DOMAINS: Mapping[str, tuple[tuple[RowKind, ...], str]] = {
-    "verification": ((RowKind.VERIFICATION,), "with independent calculations"),
-    "comparison": ((RowKind.VALIDATION, RowKind.FIT), "with flight or test data"),
+
+class DomainSource(NamedTuple):
+    """Kinds of rows that define a domain, and the source of their numbers in words."""
+
+    kinds: tuple[RowKind, ...]
+    description: str
+
+
+DOMAINS: Mapping[str, DomainSource] = {
+    "verification": DomainSource((RowKind.VERIFICATION,), "with independent calculations"),
+    "comparison": DomainSource((RowKind.VALIDATION, RowKind.FIT), "with flight or test data"),
 }
 #: Difference of a value from a limit that is a rounding error, relative to the limit.
 _TOLERANCE = 1e-9
@@ -88,7 +95,8 @@ class Validity:
         return [*texts, *(f"Missed check ({item.kind}): {item.text}." for item in self.missed)]
 
     def _describe(self, domain: Domain) -> str:
-        description = DOMAINS[domain.kind][1]
+        """Describe the cases outside of a domain, and for how many of them each quantity is the reason."""
+        description = DOMAINS[domain.kind].description
         if all(item.checked is None for item in domain.coverage):
             return f"No check compares the simulation of this system {description}."
         parts = []
@@ -110,8 +118,8 @@ def assess_validity(run: StoredRun) -> Validity:
     frame, rows = run.frame, rows_of_system(system.name)
     values = {name: list(_read_values(run, system, items)) for name, items in system.conditions.items()}
     domains = tuple(
-        _compare(kind, values, [row for row in rows if row.kind in kinds and row.is_met], len(frame))
-        for kind, (kinds, _) in DOMAINS.items()
+        _compare(kind, values, [row for row in rows if row.kind in source.kinds and row.is_met], len(frame))
+        for kind, source in DOMAINS.items()
     )
     missed = (row for row in rows if row.is_met is False)
     return Validity(len(frame), domains, tuple(MissedCheck(row.text, row.kind, row.conditions.text) for row in missed))
@@ -127,7 +135,7 @@ def _compare(kind: str, values: Mapping[str, list[pd.Series]], rows: Sequence[Va
         checked = merge_ranges([row.conditions.quantities[name] for row in rows if name in row.conditions.quantities])
         outside = np.logical_or.reduce([_mask_outside(column, checked) for column in columns])
         is_outside |= outside
-        coverage.append(Coverage(name, _summarise(known), checked, int(outside.sum())))
+        coverage.append(Coverage(name, _summarize(known), checked, int(outside.sum())))
     return Domain(kind, int(is_outside.sum()), tuple(coverage))
 
 
@@ -144,7 +152,7 @@ def _mask_outside(values: pd.Series, checked: tuple[Any, ...] | None) -> Bool[np
     return np.asarray(outside & values.notna(), dtype=np.bool_)
 
 
-def _summarise(values: pd.Series) -> tuple[Any, ...]:
+def _summarize(values: pd.Series) -> tuple[Any, ...]:
     """Return the names, or the smallest and the largest number."""
     numbers = pd.to_numeric(values, errors="coerce")
     return (
@@ -153,7 +161,11 @@ def _summarise(values: pd.Series) -> tuple[Any, ...]:
 
 
 def _read_values(run: StoredRun, system: System, items: Sequence[str]) -> Iterator[pd.Series]:
-    """Yield the values of a quantity, one series with a value per case for each column or parameter."""
+    """Yield the values of a quantity, one series with a value per case for each column or parameter.
+
+    items: `System.conditions`: the first known one of the sources of an item, which are separated by `|`, is used; a
+    source is a pattern of columns, or as in `_read_constant`
+    """
     for item in items:
         for source in item.split("|"):
             columns = [name for name in run.frame.columns if fnmatchcase(str(name), source)]
@@ -164,7 +176,10 @@ def _read_values(run: StoredRun, system: System, items: Sequence[str]) -> Iterat
 
 
 def _read_constant(run: StoredRun, system: System, source: str) -> list[pd.Series]:
-    """Read a value that is not a column: a literal, a property of the site's preset, or a parameter; empty without."""
+    """Read a value that is not a column; empty if there is none.
+
+    source: a literal (`=VALUE`), a property of the site's preset (`site.NAME`), or the path of a parameter
+    """
     if source.startswith("="):
         return [pd.Series(source[1:], index=run.frame.index)]
     if source.startswith("site."):
@@ -203,7 +218,7 @@ def validity_section(subject: Subject) -> Section | None:
         return None
     rows = [
         [
-            f"{QUANTITIES[item.quantity]}, compared {DOMAINS[domain.kind][1]}",
+            f"{QUANTITIES[item.quantity]}, compared {DOMAINS[domain.kind].description}",
             format_range(item.cases),
             NOTHING if item.checked is None else format_range(item.checked),
             f"{item.outside:,} ({percent(item.outside / validity.cases)})",

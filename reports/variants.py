@@ -24,7 +24,7 @@ from marsyard.reports.robustness import ChangeOutcome, Robustness
 from marsyard.reports.robustness_evaluation import select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.reweighted_rates import find_crossing, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import ROUNDING, find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.columns import split_unit
@@ -33,7 +33,7 @@ from marsyard.scenarios.columns import split_unit
 _STEPS = 61
 #: Margin that replaces infinite ones, which cannot be interpolated.
 _LARGE = 1e9
-#: Smallest divisor.
+#: Smallest divisor, instead of zero.
 _TINY = 1e-300
 
 
@@ -42,6 +42,7 @@ class VariantVerdict:
     """Verdict on a requirement in a variant.
 
     - estimate, lower, upper: failure rate, and its one-sided bounds at the requirement's confidence
+    - permitted: failure rate that the requirement permits
     - cases, effective_cases: number of cases that were run, and the equivalent number of random cases
     """
 
@@ -74,15 +75,14 @@ def read_robust_studies(run: StoredRun) -> list[RobustStudy]:
         if not (directory / RECORD_FILE).is_file() or not (directory / TABLE_FILE).is_file():
             continue
         stored = read_run(directory)
-        if (study := ROBUST.read(stored.record)) is None or "case" not in run.frame:
+        if (study := ROBUST.read(stored.record)) is None or "case" not in run.all_cases:
             continue
-        parameters = study[0]
-        rows = run.frame.set_index("case", drop=False)
-        if len(stored.frame) != len(parameters.variants) * len(parameters.cases):
+        parameters, _ = study
+        rows, n_variants = run.all_cases.set_index("case", drop=False), len(parameters.variants)
+        if len(stored.all_cases) != n_variants * len(parameters.cases):
             continue
         # the variants of a case follow each other
-        count = len(parameters.variants)
-        frames = [stored.frame.iloc[index::count].reset_index(drop=True) for index in range(count)]
+        frames = [stored.all_cases.iloc[index::n_variants].reset_index(drop=True) for index in range(n_variants)]
         base = rows.loc[list(parameters.cases)].reset_index(drop=True)
         studies.append(
             RobustStudy(list(zip(parameters.variants, frames, strict=True)), base, np.array(parameters.weights))
@@ -104,6 +104,7 @@ def evaluate_variants(studies: Sequence[RobustStudy], verdicts: Sequence[Verdict
 def _evaluate(
     study: RobustStudy, variant: RobustVariant, frame: pd.DataFrame, verdict: Verdict
 ) -> VariantVerdict | None:
+    """Evaluate a requirement on the rows of a variant; None if no case belongs to its population."""
     names = ("metric", "bound", "probability", "confidence", "population", "scale")
     requirement = {"id": verdict.requirement_id} | {name: getattr(verdict, name) for name in names}
     evidence = collect_evidence(frame, requirement, INDEPENDENT, has_own_terrains=True)
@@ -113,16 +114,24 @@ def _evaluate(
     groups, confidences = _groups(frame, member), _confidences(verdict)
     result = weighted_rates(study.weights[None, member], ~success[member], groups, confidences)
     estimate, lower, upper = (float(values[0]) for values in (result.estimate, result.lower, result.upper))
-    factors = _widen(success[member], groups, confidences)
-    lower, upper = lower * factors[0], min(upper * factors[1], 1.0)
+    lower_factor, upper_factor = _widen(success[member], groups, confidences)
+    lower, upper = lower * lower_factor, min(upper * upper_factor, 1.0)
     permitted = 1.0 - verdict.probability
     status = Status.PASS if upper <= permitted else Status.FAIL if lower > permitted else Status.INSUFFICIENT
     if verdict.decide_by == ESTIMATE and status is not Status.PASS:
-        status = Status.MET_BY_RATE if estimate <= permitted else Status.FAIL
+        status = Status.MET_BY_RATE if estimate <= permitted + ROUNDING else Status.FAIL
     return VariantVerdict(
-        variant.name, variant.title, verdict.requirement_id, status, estimate, lower, upper, permitted,
-        int(member.sum()), float(result.effective_units[0]),
-    )  # fmt: skip
+        variant=variant.name,
+        title=variant.title,
+        requirement=verdict.requirement_id,
+        status=status,
+        estimate=estimate,
+        lower=lower,
+        upper=upper,
+        permitted=permitted,
+        cases=int(member.sum()),
+        effective_cases=float(result.effective_units[0]),
+    )
 
 
 def _confidences(verdict: Verdict) -> tuple[float, float]:
@@ -135,7 +144,7 @@ def _confidences(verdict: Verdict) -> tuple[float, float]:
 def _widen(
     success: Bool[np.ndarray, " m"], groups: Int[np.ndarray, " m"] | None, confidences: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return factors of both bounds, so that they are at least as wide as those that hold for any correlation.
+    """Return factors of lower and upper bound, with which they hold for any correlation within terrains.
 
     The factors are those of equal weights; 1 without shared terrains.
     """
@@ -179,19 +188,25 @@ def evaluate_steps(
 def _find_step(
     study: RobustStudy, verdict: Verdict, path: str, values: Sequence[float], margins: Float64[np.ndarray, "steps n"]
 ) -> Robustness:
-    """Find the value of a parameter at which PASS turns into FAIL; `values` begin with the assumed one."""
+    """Find the value of a parameter at which PASS turns into FAIL.
+
+    - values: assumed value, and the others in the order of their distance from it
+    - margins: margins of the cases at these values; infinite outside the population
+    """
     assumed, farthest = values[0], values[-1]
     positions = np.abs(np.array(values) - assumed)
     grid = np.linspace(0.0, positions[-1], _STEPS)
     finite = np.clip(margins, -_LARGE, _LARGE)
     failure = np.array([np.interp(grid, positions, column) < 0.0 for column in finite.T]).T
+    # a case has a weight where it belongs to the population at the nearest value, or violates the requirement
     nearest = np.abs(grid[:, None] - positions).argmin(axis=1)
     weights = study.weights * ((margins[nearest] < math.inf) | failure)
     groups, confidences = _groups(study.base, np.ones(len(study.base), dtype=np.bool_)), _confidences(verdict)
     result = weighted_rates(weights, failure, groups, confidences)
-    # the factors of both ends and of the middle of the range
-    factors = np.array([_widen(~failure[step], groups, confidences) for step in (0, _STEPS // 2, _STEPS - 1)])
-    result = replace(result, lower=result.lower * factors[:, 0].min(), upper=result.upper * factors[:, 1].max())
+    # the widest bounds of both ends and of the middle of the range
+    factors = [_widen(~failure[step], groups, confidences) for step in (0, _STEPS // 2, _STEPS - 1)]
+    lower_factors, upper_factors = zip(*factors, strict=True)
+    result = replace(result, lower=result.lower * min(lower_factors), upper=result.upper * max(upper_factors))
     spread = abs(assumed) or abs(farthest)
     by_rate = verdict.decide_by == ESTIMATE
     crossing = find_crossing(grid / spread, result, 1.0 - verdict.probability, decides_by_rate=by_rate)

@@ -78,12 +78,14 @@ class Verdict:
     - status: PASS if the lower bound is at least the probability, FAIL if the upper bound is below it, otherwise
       INSUFFICIENT. If `decide_by` is "estimate" and the bounds do not result in PASS: FAIL if the rate is below the
       probability, INSUFFICIENT for fewer cases than `min_cases_for_rate`, otherwise MET BY RATE
+    - n: number of cases of the population
     - failures: cases with a missing, NaN or too large metric, unfinished cases, cases with a missing population flag
     - estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases; no bounds for other designs
     - additional_cases: those without failure for PASS, on new terrains if terrains are shared; None if unknown
     - consumer_risk: probability of this result or a better one if the true rate equals the required rate
     - reason: why the requirement is not evaluated, or why the verdict is withheld
     - advice: why more cases cannot lead to PASS, and which change of the campaign can
+    - scale: factor of the metric before it is compared with the bound
     - accept_rate: whether MET BY RATE results in the exit status 0
     - withheld_status: status without regard to the kind of evidence, if it was replaced by INSUFFICIENT; otherwise None
     - all_cases: result of the same requirement on all cases; None if its population is all cases

@@ -31,6 +31,7 @@ def number(value: float) -> str:
     magnitude = abs(value) if abs(value) >= _ROUNDING else 0.0
     if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
         return f"{value:.2e}".replace("-", "−")
+    # numbers of decimals for magnitudes up to each limit
     digits_by_limit = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
     digits = next(digits for limit, digits in digits_by_limit if magnitude <= limit)
     return f"{value if magnitude else 0.0:.{digits}f}".replace("-", "−")

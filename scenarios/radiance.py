@@ -53,7 +53,7 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
     ambient = 0.5 * (sky + float(frame.radiance.mean()))
     radiance, transmission = frame.radiance.reshape(-1), transmission.reshape(-1)
     scattering = air.single_scattering_albedo, air.asymmetry, ambient
-    hazy = add_air_light(radiance, transmission, frame.rays.device.directions, sun_body, *scattering)
+    hazy = add_air_light(radiance, transmission, frame.rays.device_rays.directions, sun_body, *scattering)
     return hazy.reshape(frame.radiance.shape)
 
 

@@ -16,7 +16,7 @@ UNFINISHED, MAX_UNFINISHED_AGE_S = ".part", 86400.0
 
 def cache_directory(kind: str) -> Path:
     """Create and return the cache folder `kind`, a subfolder of ``MARSYARD_CACHE`` or of the user's cache folder."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard"
+    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marsyard"
     directory = Path(os.environ.get("MARSYARD_CACHE") or default) / kind
     directory.mkdir(parents=True, exist_ok=True)
     return directory

@@ -92,7 +92,7 @@ def accumulate_quaternions(steps: Quaternions) -> Quaternions:
     Recursion: the cumulative products of pairs are every second result; the others require one more product each.
     """
     count = len(steps)
-    if count == 1:
+    if count <= 1:
         return steps
     pair_products = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
     cumulative = np.empty((count, 4))

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.contributions import compute_budget
-from marsyard.reports.statistics.difference_tests import compare_errors
+from marsyard.reports.statistics.paired_tests import compare_errors
 from marsyard.sim.error_sources import ErrorSource
 
 #: Two-sided confidence of the checked intervals, and largest permitted shortfall of the coverage for skewed values.

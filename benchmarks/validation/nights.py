@@ -8,7 +8,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.nightly import FINISHED, History, NightCampaign, NightComparison, find_changes, list_comparisons
+from marsyard.reports.night_history import FINISHED, History, NightCampaign
+from marsyard.reports.nightly import NightComparison, find_changes, list_comparisons
 from marsyard.reports.statistics.difference_tests import Metric, Sample
 
 #: Assignments of cases to terrains.

@@ -18,7 +18,7 @@ from benchmarks.validation.nights import (
     count_false_alarms,
 )
 from benchmarks.validation.records import Check, Measure, min_coverage
-from marsyard.reports.nightly import MAX_EARLIER_NIGHTS
+from marsyard.reports.night_history import MAX_EARLIER_NIGHTS
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.clusters import Sizes, event_scores, max_statistic, number_terrains
 from marsyard.reports.statistics.error_summary import error_ellipse

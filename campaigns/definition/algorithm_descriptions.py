@@ -7,9 +7,8 @@ from typing import Any
 
 from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.components import list_algorithms
+from marsyard.campaigns.definition.components import list_algorithms, list_compared_algorithms
 from marsyard.campaigns.definition.identity import custom_sources, distribution_version, hash_sources
-from marsyard.campaigns.definition.parameter_paths import find_value
 from marsyard.scenarios.custom_algorithms import custom_path, describe_custom
 from marsyard.scenarios.imports import source_files
 from marsyard.scenarios.interface import HasAlgorithms
@@ -28,18 +27,20 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     selected_scenario = campaign.scenario
     if not isinstance(selected_scenario, HasAlgorithms):
         return []
-    compared = find_value(campaign.definition.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
-    parameters: Any = campaign.base_parameters()
+    task = selected_scenario.task
+    compared = list_compared_algorithms(campaign.definition)
+    table: Any = campaign.base_parameters()
     for name in selected_scenario.algorithm_table:
-        parameters = getattr(parameters, name)
+        table = getattr(table, name)
+    # the options of the shipped algorithms are one value of the table, if the scenario has any
+    configured_options = next((value for _, value in table if isinstance(value, task.options)), task.options())
     entries = []
     for spec in list_algorithms(campaign.definition):
         # shipped algorithms are installed with Marsyard; their sources are all of `marsyard.algorithms`
-        is_shipped = spec in selected_scenario.task.shipped
+        is_shipped = spec in task.shipped
         sources = list(source_files("marsyard.algorithms:") if is_shipped else custom_sources(spec))
         if is_shipped:
-            configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
-            algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
+            algorithm = task.shipped[spec](configured_options)
             algorithm_class, version = type(algorithm), distribution_version("marsyard")
             path = f"{algorithm_class.__module__}:{algorithm_class.__qualname__}"
             options = plain_options(getattr(algorithm, "options", None))

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.parameter_paths import replace_values, value_at
-from marsyard.campaigns.sampling.correlation import MIN_DRAW, correlate_groups
+from marsyard.campaigns.sampling.correlation import MIN_DRAW, CorrelatedGroup, correlate_groups
 from marsyard.campaigns.sampling.design import build_stratified_design, compute_grid_quantiles, locate_case
 from marsyard.campaigns.sampling.dispersion_base import Dispersion
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, GridDispersion, Normal
@@ -127,7 +127,7 @@ class Campaign:
             numbers = correlate_groups(self.draw_uniform(case), definition.correlations)
         else:
             groups = tuple(
-                (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
+                CorrelatedGroup(tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
                 for group in definition.correlations
             )
             design = build_stratified_design(

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import POPULATIONS, Requirement
 from marsyard.campaigns.definition.components import list_algorithms
-from marsyard.campaigns.definition.parameter_paths import find_value, leaves, value_at
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, paths_overlap, value_at
 from marsyard.campaigns.definition.toml_models import Key, key_text, validation_problems
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
@@ -198,7 +198,11 @@ def find_unknown_columns(
     numbers: Sequence[str],
     is_known: Callable[[str, str], bool],
 ) -> list[tuple[Key, str]]:
-    """List columns of requirements with an unknown name or kind: keys, and messages with the allowed columns."""
+    """List columns of requirements with an unknown name or kind: keys, and messages with the allowed columns.
+
+    - flags, numbers: names of the known columns of each kind, for the messages
+    - is_known: whether a column with this name has this kind (`FLAGS` or `NUMBERS`)
+    """
     problems: list[tuple[Key, str]] = []
     for index, requirement in enumerate(requirements):
         kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
@@ -220,7 +224,7 @@ def _collect_columns(campaign: Campaign) -> Columns | None:
     scores: list[Column] = []
     keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
     for path in (path for path, kind in keys.items() if kind is SCORE):
-        if path in definition.dispersions:
+        if any(paths_overlap(path, name) for name in definition.dispersions):
             return None
         for label in labels(find_value(definition.parameters, path)):
             scores += [Column(f"{label}_*", ColumnKind.ERROR, "custom score", type=kind) for kind in (float, bool)]

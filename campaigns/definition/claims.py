@@ -24,7 +24,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.components import list_parts
 from marsyard.campaigns.definition.identity import custom_sources, hash_code, hash_inputs
-from marsyard.campaigns.definition.parameter_paths import find_value, leaves, replace_values
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, paths_overlap, replace_values
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import scenario_source
@@ -88,7 +88,9 @@ class FrozenAlgorithm:
 class Confirmation:
     """A confirmation in the record of confirmations.
 
-    - claim: identity of its content (`FrozenAlgorithm.claim`)
+    - campaign, folder: name of its campaign, and of the folder of the run
+    - frozen, claim: its content, and the identity of this content (`FrozenAlgorithm.claim`)
+    - started_utc, git_commit: time and commit of its start
     - number: number of the confirmation of its claim, from 1
     - seed, bank_seeds: seed of the draws, and seeds of the terrain banks by parameter path
     - cases: number of cases that it has announced, with appended ones
@@ -217,12 +219,9 @@ def confirmation_seed(claim: str, head: str) -> int:
 
 def bank_seeds(definition: CampaignDefinition) -> dict[str, int]:
     """Return the seeds of the terrain banks of a campaign by parameter path, except dispersed ones."""
-    values = leaves(definition.parameters)
-    return {
-        path: value
-        for path, value in values
-        if path.rpartition(".")[2] == _BANK_SEED and path not in definition.dispersions
-    }
+    seeds = {path: value for path, value in leaves(definition.parameters) if path.rpartition(".")[2] == _BANK_SEED}
+    dispersions = definition.dispersions
+    return {path: seed for path, seed in seeds.items() if not any(paths_overlap(path, name) for name in dispersions)}
 
 
 def confirmation_bank_seeds(definition: CampaignDefinition, claim: str, head: str) -> dict[str, int]:

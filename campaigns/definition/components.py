@@ -2,31 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
-from marsyard.campaigns.definition.parameter_paths import find_value
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, paths_overlap
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline_algorithms import is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 
 def list_algorithms(definition: CampaignDefinition) -> tuple[str, ...]:
-    """List the algorithms in a definition or its dispersions: under test, then compared."""
+    """List the algorithms in a definition, under test, then compared; then further ones in its dispersions."""
+    keys = _algorithm_keys(definition)
+    trees = _list_trees(definition, keys)
+    return tuple(dict.fromkeys(name for tree in trees for key in keys for name in _list_names(tree, key)))
+
+
+def list_compared_algorithms(definition: CampaignDefinition) -> tuple[str, ...]:
+    """List the algorithms that are compared with that under test, in a definition or its dispersions."""
+    keys = _algorithm_keys(definition)[1:]
+    return tuple(name for tree in _list_trees(definition, keys) for key in keys for name in _list_names(tree, key))
+
+
+def _algorithm_keys(definition: CampaignDefinition) -> tuple[str, ...]:
+    """Return the paths of the algorithm under test and of the compared ones; empty if the scenario selects none."""
     selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):
         return ()
-    tested_key, compared_key = (
-        ".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared")
-    )
-    specs = [find_value(definition.parameters, tested_key), *find_value(definition.parameters, compared_key)]
-    if tested_key in definition.dispersions:
-        specs += definition.dispersions[tested_key].extremes()
-    return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
+    return tuple(".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared"))
 
 
-def own_limits(definition: CampaignDefinition) -> tuple[float, float]:
+def _list_trees(definition: CampaignDefinition, keys: Collection[str]) -> list[Any]:
+    """List the parameters, and trees with the values of dispersions that can contain a name at one of the paths."""
+    trees: list[Any] = [definition.parameters]
+    for path, dispersion in definition.dispersions.items():
+        if dispersion.formulas or not any(paths_overlap(path, key) for key in keys):
+            continue
+        for tree in dispersion.extremes():
+            for name in reversed(path.split(".")):
+                tree = {name: tree}
+            trees.append(tree)
+    return trees
+
+
+def _list_names(tree: Any, key: str) -> list[str]:
+    """List the names at a path in a tree: a text, or a list of texts."""
+    value = find_value(tree, key)
+    values = leaves(list(value) if isinstance(value, tuple) else value)
+    return [name for _, name in values if name and isinstance(name, str)]
+
+
+def algorithm_process_limits(definition: CampaignDefinition) -> tuple[float, float]:
     """Return the time (s) and memory (bytes) that the algorithms in processes of their own may use for one case."""
     selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):
@@ -44,20 +72,14 @@ def list_parts(definition: CampaignDefinition) -> tuple[str, ...]:
     selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasParts):
         return ()
-    parameter_trees = [definition.parameters]
-    for path, dispersion in definition.dispersions.items():
-        if any(f"{key}.".startswith(f"{path}.") for key in selected_scenario.part_keys):
-            for tree in dispersion.extremes():
-                for name in reversed(path.split(".")):
-                    tree = {name: tree}
-                parameter_trees.append(tree)
-    paths: dict[str, None] = {}
-    for tree in parameter_trees:
-        for key, kind in selected_scenario.part_keys.items():
-            value = find_value(tree, key)
-            specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]
-            paths.update(dict.fromkeys(map(kind.path, specs)))
-    return tuple(paths)
+    kinds = selected_scenario.part_keys
+    names = (
+        (kind, name)
+        for tree in _list_trees(definition, kinds)
+        for key, kind in kinds.items()
+        for name in _list_names(tree, key)
+    )
+    return tuple(dict.fromkeys(kind.path(name) for kind, name in names))
 
 
 def find_scenario(name: object) -> Scenario | None:

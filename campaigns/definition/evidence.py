@@ -67,13 +67,19 @@ class Evidence:
         """Read from the record of a run; without a valid entry it is an exploration."""
         if not isinstance(stored, Mapping):
             return cls()
-        names = ("number", "claim", "record", "registration", "overlap", "imported_terrain")
-        values = {name: stored[name] for name in names if name in stored}
+        overlap = stored.get("overlap")
         try:
             return cls(
-                EvidenceKind(str(stored.get("kind"))), changes=tuple(map(str, stored.get("changes") or ())), **values
+                EvidenceKind(str(stored.get("kind"))),
+                number=int(stored.get("number", 0)),
+                claim=str(stored.get("claim", "")),
+                record=str(stored.get("record", "")),
+                registration=str(stored.get("registration", "")),
+                overlap=None if overlap is None else float(overlap),
+                imported_terrain=bool(stored.get("imported_terrain", False)),
+                changes=tuple(map(str, stored.get("changes") or ())),
             )
-        except ValueError:
+        except (TypeError, ValueError):
             return cls()
 
     def to_table(self) -> dict[str, Any]:

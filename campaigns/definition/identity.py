@@ -34,6 +34,9 @@ _CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")
 _KEYS_WITHOUT_EFFECT = frozenset(
     {"appended", "calibration", "description", "limits", "max_cases", "requirements", "retain"}
 )
+#: Number of digits of a hash in the description of a difference.
+_DIGITS = 12
+#: Folder of the program, with `_CODE_FOLDERS`.
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 
@@ -60,11 +63,13 @@ class Identity:
 
     def differences(self, other: Identity) -> list[str]:
         """Describe the differences from another identity, each in a few words."""
-        pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("definition", "code")}
+        pairs = {
+            name: (getattr(self, name)[:_DIGITS], getattr(other, name)[:_DIGITS]) for name in ("definition", "code")
+        }
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
         common_names = sorted({*self.inputs} & {*other.inputs})
-        pairs.update({name: (self.inputs[name][:12], other.inputs[name][:12]) for name in common_names})
+        pairs.update({name: (self.inputs[name][:_DIGITS], other.inputs[name][:_DIGITS]) for name in common_names})
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 

@@ -16,6 +16,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.checks import find_campaign_problems
 from marsyard.campaigns.definition.components import find_scenario
+from marsyard.campaigns.definition.parameter_paths import paths_overlap
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.definition.toml_models import Key, Model, key_text, read_tables, validation_problems
 from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
@@ -196,9 +197,7 @@ def _apply_option(
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
         path_pairs = ((path, key) for path in dispersions for key in parameter_paths)
-        removed_paths = {
-            path for path, key in path_pairs if f"{path}.".startswith(f"{key}.") or key.startswith(f"{path}.")
-        }
+        removed_paths = {path for path, key in path_pairs if paths_overlap(path, key)}
         merged["dispersions"] = {path: item for path, item in dispersions.items() if path not in removed_paths}
         if removed_paths and isinstance(merged.get("correlations"), list):
             groups = [_remove_members(group, removed_paths) for group in merged["correlations"]]

@@ -16,8 +16,8 @@ from typing import Any
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 
-#: Margin of a case whose boolean metric is false, although its margin column is not negative.
-_MAX_VIOLATION_MARGIN = -1e-12
+#: Margin of a case whose boolean metric is false, although its margin column is not negative: the nearest violation.
+MAX_VIOLATION_MARGIN = -1e-12
 
 
 def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
@@ -37,7 +37,7 @@ def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
         margin = None if requirement.margin is None else row.get(requirement.margin)
         if not isinstance(margin, int | float) or math.isnan(margin):
             return 1.0 if is_met else -1.0
-        return max(margin, 0.0) if is_met else min(margin, _MAX_VIOLATION_MARGIN)
+        return max(margin, 0.0) if is_met else min(margin, MAX_VIOLATION_MARGIN)
     if not all(isinstance(value, int | float) for value in values):
         return -math.inf
     margin = requirement.bound - abs(requirement.scale * sum(values))

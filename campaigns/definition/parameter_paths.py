@@ -43,6 +43,15 @@ def find_value(tree: Any, path: str) -> Any:
         return ()
 
 
+def paths_overlap(first: str, second: str) -> bool:
+    """Whether two dotted paths are equal, or one of them leads to a table or list that contains the other.
+
+    >>> paths_overlap("wind", "wind.east_m_s"), paths_overlap("wind", "winds")
+    (True, False)
+    """
+    return f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}.")
+
+
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield every value in nested tables and lists with its dotted path."""
     if isinstance(tree, Mapping):

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from marsyard.campaigns.definition.campaign_file import Requirement
-from marsyard.campaigns.definition.toml_models import Key, read_table
+from marsyard.campaigns.definition.toml_models import Key, read_model
 from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
@@ -39,7 +39,7 @@ def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
 
     Raises DefinitionError if it is unreadable or invalid; every problem has its key.
     """
-    requirements = read_table(path, _RequirementsFile).requirements
+    requirements = read_model(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
     repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
     if repeated_ids:

@@ -31,7 +31,7 @@ def read_tables(path: Path) -> dict[str, Any]:
         raise DefinitionError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
 
 
-def read_table(path: Path, model: type[Model]) -> Model:
+def read_model(path: Path, model: type[Model]) -> Model:
     """Read a complete TOML file into a model. Raises DefinitionError; each problem has its key."""
     try:
         return model.model_validate(read_tables(path))

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.parameter_paths import value_at
-from marsyard.campaigns.definition.toml_models import read_table
+from marsyard.campaigns.definition.toml_models import read_model
 from marsyard.scenarios.systems import find_system
 from marsyard.sim.parameters import Parameters
 
@@ -47,4 +47,4 @@ def system_variants(scenario: str) -> tuple[SystemVariant, ...]:
     """Read the variants of the system of a scenario; empty without any. Raises DefinitionError for an invalid file."""
     system = find_system(scenario)
     path = None if system is None or system.folder is None else system.folder / "variants.toml"
-    return read_table(path, _VariantsFile).variants if path is not None and path.is_file() else ()
+    return read_model(path, _VariantsFile).variants if path is not None and path.is_file() else ()

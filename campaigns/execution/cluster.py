@@ -38,9 +38,12 @@ _TIMEOUT_S, _NO_WORKERS_S = 60, 3600
 _REFRESH_S, _POLL_S = 10.0, 0.02
 #: Batches queued at each Dask worker, so that no worker waits for the network.
 _QUEUED_BATCHES = 2
+#: Advice after an error that ends the campaign.
+_ADVICE = "the finished cases are stored, `marsyard resume` continues"
 #: Maximum number of times that the cluster may abandon a single case.
 _MAX_ABANDONED = 5
-#: Executor of each thread of a Dask worker (`workers`), and with how many executors it shares the memory (`executors`).
+#: Executor of each thread of a Dask worker (`executor`), and the number of executors that share the memory of its
+#: machine (`executor_count`).
 _thread_state = threading.local()
 
 
@@ -50,10 +53,11 @@ CodeIdentity = tuple[str, tuple[tuple[str, str], ...]]
 
 def check_identity(worker: str, theirs: CodeIdentity, ours: CodeIdentity) -> None:
     """Compare the code of a worker with that of the client. Raises CampaignError if they differ."""
-    if theirs[0] != ours[0]:
+    (their_code, their_pairs), (our_code, our_pairs) = theirs, ours
+    if their_code != our_code:
         raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
-    their_versions = dict(theirs[1])
-    differing = [(name, version) for name, version in ours[1] if version != their_versions.get(name)]
+    their_versions = dict(their_pairs)
+    differing = [(name, version) for name, version in our_pairs if version != their_versions.get(name)]
     if differing:
         pairs = (f"{name} {their_versions.get(name)} (here {version})" for name, version in differing)
         raise CampaignError(f"worker {worker} has different versions: {', '.join(pairs)}")
@@ -116,8 +120,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
     def is_connected(self) -> bool:
         """Whether the scheduler is connected. Raises CampaignError if it was lost, and did not return in time."""
         if self._client.status == "closed":
-            hint = "the finished cases are stored, `marsyard resume` continues"
-            raise CampaignError(f"--cluster {self._address}: the scheduler is lost; {hint}")
+            raise CampaignError(f"--cluster {self._address}: the scheduler is lost; {_ADVICE}")
         return bool(self._client.status == "running")
 
     def count_threads(self) -> tuple[int, int]:
@@ -230,8 +233,7 @@ class _BatchQueue:
             is_abandoned = True
         except Exception as error:
             if not self._cluster.is_lost_with_workers(error):
-                hint = "the finished cases are stored, `marsyard resume` continues"
-                raise CampaignError(f"the cluster cannot run a batch: {error!r}; {hint}") from error
+                raise CampaignError(f"the cluster cannot run a batch: {error!r}; {_ADVICE}") from error
             is_abandoned = False
         else:
             self._batches.record_time(len(batch), seconds)

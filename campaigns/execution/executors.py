@@ -35,5 +35,5 @@ def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
 
 
 def available_cores() -> int:
-    """Number of processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

@@ -102,6 +102,9 @@ class MonitoredWorker:
     """One worker process, which is monitored, and replaced when it dies.
 
     Signals are sent only to the process that loky started: the worker's supervisor, which ends after its descendants.
+
+    - folder: new folder of the worker, with a folder for the files of each process
+    - is_loading: whether the latest submission loads the code of its work instead of running the batch
     """
 
     def __init__(self, folder: Path) -> None:
@@ -120,7 +123,7 @@ class MonitoredWorker:
         self._termination: WorkerDeath | None = None
         self._loaded: Work[Any] | None = None
         self.is_loading = False
-        self._clock = BatchClock([0], -math.inf)
+        self._clock = BatchClock([0], -math.inf)  # until the first batch
         self._checked_s = -math.inf
         self._process: Any = None
         self._executor: Any = ProcessPoolExecutor(

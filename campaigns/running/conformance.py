@@ -14,13 +14,16 @@ from marsyard.scenarios.conformance.checks import Finding
 
 #: Limits of output and memory of a conformance check, bytes.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
+#: Time for the other work of a check in addition to twice the time of an answer, s.
+_MARGIN_S = 5.0
 
 
 def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Subject:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
-    limit_s: time limit of one answer
-    task: task of the algorithm; None for the task that its interface determines.
+    - task: task of the algorithm; None for the task that its interface determines
+    - limit_s: time limit of one answer
+
     Raises CampaignError if the name or the task is unknown.
     """
     if task is not None and task not in candidates.subject_kinds():
@@ -35,10 +38,10 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.Su
 
 def run_conformance_checks(subject: candidates.Subject) -> Iterator[Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
-    # the time limit of an answer, the same time for the other work of the check, and 5 s
-    limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
+    limits = WorkLimits(2.0 * subject.limit_s + _MARGIN_S, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
         for number, (name, requirement) in enumerate(candidates.list_checks(subject)):
+            # one batch with one result
             ((result,),) = workers.run(
                 Work(partial(candidates.run_check, subject), [number], limits, load=partial(_load_subject, subject))
             )

@@ -1,6 +1,7 @@
 """Estimate of the time and disk space of a campaign before it runs, from a few trial cases."""
 
 import json
+import math
 import statistics
 import time
 from dataclasses import dataclass
@@ -63,6 +64,7 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
                 break
             build_times += _build_inputs(campaign, executor, plan, case)
             case_start_s = time.monotonic()
+            # one batch with one case
             ((completed,),) = run_cases(executor, definition, [case], selection=ALL_PRODUCTS)
             trials.append(completed)
             times.append(time.monotonic() - case_start_s)
@@ -72,7 +74,13 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
     product_bytes = statistics.fmean(trial.products.size if trial.products else 0 for trial in trials)
     retain = definition.retain
     # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
-    stored_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
+    stored_cases = {
+        "none": 0,
+        "all": total,
+        "failed": total,
+        "worst": retain.worst,
+        "every": math.ceil(total / retain.every),
+    }
     products = min(total, stored_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
     return CampaignEstimate(
         trials=len(trials),

@@ -28,6 +28,8 @@ from marsyard.scenarios.tasks import Task
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
 #: Version of the layout of the manifest.
 SCHEMA = 1
+#: Maximum number of cases in a message.
+_MAX_LISTED = 8
 
 
 def truth_folder(directory: Path) -> Path:
@@ -43,8 +45,7 @@ def export_campaign(
     - campaign: its algorithm is `export:` with the path of the exported folder
     - directory, truth: exported folder, and folder of the campaign's rows with the ground truth
 
-    Raises CampaignError if the folders contain other files, or
-    are not writable.
+    Raises CampaignError if the folders contain other files, or are not writable.
     """
     if truth.resolve().is_relative_to(directory.resolve()):
         raise CampaignError(f"--truth {truth}: is inside {directory}, which the team under test receives")
@@ -131,16 +132,16 @@ def _check_answers(task: Task[Any, Any], definition: CampaignDefinition, answers
         raise CampaignError(f"{answers}: unknown case {_list_first(unknown_cases)}; allowed: 0 to {total - 1}")
     missing_cases = [case for case in range(total) if case not in answers_by_case]
     if missing_cases:
-        refusals = list(task.offline.form.outcomes.__members__)[1:]
-        advice = f"a case without an answer needs a line with its outcome, such as {refusals[0]}"
+        _, refusal, *_ = task.offline.form.outcomes.__members__  # the first outcome is that of an answer
+        advice = f"a case without an answer needs a line with its outcome, such as {refusal}"
         raise CampaignError(
             f"{answers}: no answer to {len(missing_cases)} of {total} cases: {_list_first(missing_cases)}; {advice}"
         )
 
 
 def _list_first(cases: Sequence[int]) -> str:
-    """Format up to eight case numbers."""
-    return ", ".join(str(case) for case in cases[:8]) + (", ..." if len(cases) > 8 else "")
+    """Format the first case numbers."""
+    return ", ".join(map(str, cases[:_MAX_LISTED])) + (", ..." if len(cases) > _MAX_LISTED else "")
 
 
 def _find_task(campaign: Campaign) -> Task[Any, Any]:

@@ -82,6 +82,7 @@ def replay_in_executor(
     text = None if stored is None else stored.get(POINT_COLUMN)
     points = {case: StudyPoint.read(text)} if isinstance(text, str) else {}
     selection = REPLAYED_PRODUCTS if timeline else ALL_PRODUCTS
+    # one batch with one case
     ((completed,),) = run_cases(executor, definition, [case], selection=selection, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)

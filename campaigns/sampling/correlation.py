@@ -14,7 +14,7 @@ the end of a group does not change the numbers of the other members.
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,8 +27,6 @@ from marsyard.sim.parameters import Parameters
 MIN_DRAW = 2.0**-54
 #: Maximum draw, the largest float below 1.
 MAX_DRAW = 1.0 - 2.0**-53
-#: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
-CorrelatedGroup = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
 _Matrix = tuple[tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...], ...]
 #: Relative tolerance of the check for symmetry, since files contain rounded numbers.
 _ROUNDING = 1e-9
@@ -97,6 +95,13 @@ class Correlation(Parameters):
     def factor(self) -> Float64[np.ndarray, "n n"]:
         """Lower triangular L with L L^T = R."""
         return np.asarray(np.linalg.cholesky(self.normal_correlation))
+
+
+class CorrelatedGroup(NamedTuple):
+    """Indices of a correlated group's members among the dispersions, and the rows of its factor L (hashable)."""
+
+    members: tuple[int, ...]
+    factor: tuple[tuple[float, ...], ...]
 
 
 def correlate_uniform(

@@ -62,7 +62,7 @@ class Design(Parameters):
                 condition = " at each point of the grid" if grid_size > 1 else ""
                 problem = f"a Sobol design needs a power of 2{condition}, such as {lower_power} or {2 * lower_power}"
             if problem:
-                after_nominal = " after the nominal case" * nominal_cases
+                after_nominal = " after the nominal case" if nominal_cases else ""
                 return index, f"{cases} cases{after_nominal} do not fit the sampling design: {problem}"
         return None
 

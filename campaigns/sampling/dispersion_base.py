@@ -19,6 +19,8 @@ from marsyard.sim.parameters import Parameters
 
 #: Probability of each tail that is ignored when a distribution is compared with the allowed range of a parameter.
 TAIL = 1e-12
+#: Maximum number of characters of a list of more than two values in a description.
+_MAX_LIST = 60
 
 
 class Dispersion(Parameters, ABC):
@@ -82,7 +84,7 @@ class Dispersion(Parameters, ABC):
             text = str(value)
             if isinstance(value, list | tuple):
                 values_text = ", ".join(str(item) for item in value)
-                is_short = len(value) <= 2 or len(values_text) <= 60
+                is_short = len(value) <= 2 or len(values_text) <= _MAX_LIST
                 text = f"[{values_text}]" if is_short else f"[{value[0]}, ... {len(value)} in all]"
             texts.append(f"{name}={text}")
         return f"{getattr(self, 'distribution', '?')}({', '.join(texts)})"

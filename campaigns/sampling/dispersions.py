@@ -193,8 +193,14 @@ class Normal(base.Dispersion):
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
-        if self.sd is not None and not self.formulas:
-            truncated_quantile(STANDARD_NORMAL, self._standard_limits, 0.5)
+        if self.sd is None or self.truncate is None or self.formulas:
+            return self
+        try:
+            self.quantile(0.5)
+        except ValueError as error:
+            # the limits in its message are those of the standard normal distribution
+            reason = str(error).partition(": ")[2]
+            raise ValueError(f"truncate = [{self.truncate[0]}, {self.truncate[1]}]: {reason}") from error
         return self
 
     @cached_property

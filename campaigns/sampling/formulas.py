@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from marsyard.campaigns.errors import suggest_similar
 
@@ -24,15 +24,25 @@ _UNARY_OPERATORS: Mapping[type[ast.unaryop], Callable[[float], float]] = {
     ast.UAdd: operator.pos,
     ast.USub: operator.neg,
 }
-#: Functions by name, with the minimum and maximum number of arguments.
-_FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
-    **{name: (getattr(math, name), 1, 1) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos")},
-    **{name: (getattr(math, name), 1, 1) for name in ("atan", "radians", "degrees", "floor", "ceil")},
-    "abs": (abs, 1, 1),
-    "atan2": (math.atan2, 2, 2),
-    "hypot": (math.hypot, 2, 8),
-    "min": (min, 2, 8),
-    "max": (max, 2, 8),
+
+
+class _Function(NamedTuple):
+    """A function of formulas, with its minimum and maximum number of arguments."""
+
+    call: Callable[..., float]
+    min_arguments: int = 1
+    max_arguments: int = 1
+
+
+#: Functions by name.
+_FUNCTIONS: Mapping[str, _Function] = {
+    **{name: _Function(getattr(math, name)) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos")},
+    **{name: _Function(getattr(math, name)) for name in ("atan", "radians", "degrees", "floor", "ceil")},
+    "abs": _Function(abs),
+    "atan2": _Function(math.atan2, 2, 2),
+    "hypot": _Function(math.hypot, 2, 8),
+    "min": _Function(min, 2, 8),
+    "max": _Function(max, 2, 8),
 }
 _CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
@@ -96,12 +106,12 @@ def _list_names(node: ast.expr) -> list[str]:
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY_OPERATORS:
             return _list_names(left) + _list_names(right)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-            _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
-            if not maximum:
+            if name not in _FUNCTIONS:
                 allowed = sorted(_FUNCTIONS)
                 raise ValueError(
                     f"unknown function '{name}'{suggest_similar(name, allowed)}; allowed: {', '.join(allowed)}"
                 )
+            _, minimum, maximum = _FUNCTIONS[name]
             if not minimum <= len(arguments) <= maximum:
                 accepted_numbers = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
                 raise ValueError(f"{name} takes {accepted_numbers} arguments, not {len(arguments)}")
@@ -131,6 +141,6 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
         case ast.BinOp(left=left, op=op, right=right):
             return _BINARY_OPERATORS[type(op)](_evaluate(left, numbers), _evaluate(right, numbers))
         case ast.Call(func=ast.Name(id=name), args=arguments):
-            return float(_FUNCTIONS[name][0](*(_evaluate(argument, numbers) for argument in arguments)))
+            return float(_FUNCTIONS[name].call(*(_evaluate(argument, numbers) for argument in arguments)))
     path = _format_path(node)
     return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]

@@ -47,12 +47,16 @@ class StudyPoint:
     def read(cls, text: str) -> Self:
         """Read a point from its text. Raises ValueError for any other text."""
         try:
-            coordinates, stream, nominal, removed, *rest = json.loads(text)
-            blends, values = [*rest, [], []][:2]
-            blend = tuple((int(number), float(weight)) for number, weight in blends)
-            names = tuple(map(str, nominal)), tuple(map(str, removed))
-            replaced = tuple((str(path), value) for path, value in values)
-            return cls(tuple(map(float, coordinates)), int(stream), *names, blend, replaced)
+            coordinates, stream, nominal, removed, *present = json.loads(text)
+            blend, values = [*present, [], []][:2]  # `text` omits them if they are empty
+            return cls(
+                tuple(map(float, coordinates)),
+                int(stream),
+                nominal=tuple(map(str, nominal)),
+                removed=tuple(map(str, removed)),
+                blend=tuple((int(number), float(weight)) for number, weight in blend),
+                values=tuple((str(path), value) for path, value in values),
+            )
         except (TypeError, ValueError) as error:
             raise ValueError(f"not a point of a study: {text!r:.100}") from error
 

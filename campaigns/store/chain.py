@@ -10,6 +10,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 from marsyard.campaigns.store.key import is_signature, sign
 
@@ -33,6 +34,13 @@ ORDER BY chain.position
 """
 
 
+class Seal(NamedTuple):
+    """Digest of a seal, and whether this user signed it."""
+
+    digest: str
+    is_own: bool
+
+
 def first_head(about: Mapping[str, str]) -> bytes:
     """Return the head of an empty store from the texts that identify its campaign."""
     return hashlib.sha256(json.dumps(dict(about), sort_keys=True).encode()).digest()
@@ -54,10 +62,10 @@ def write_seal(connection: sqlite3.Connection, name: str, digest: str) -> None:
     connection.execute("INSERT OR REPLACE INTO seals VALUES (?, ?, ?)", (name, digest, signature))
 
 
-def read_seals(connection: sqlite3.Connection) -> dict[str, tuple[str, bool]]:
-    """Return the digest of each seal, and whether this user signed it."""
+def read_seals(connection: sqlite3.Connection) -> dict[str, Seal]:
+    """Return the seals by name."""
     seals = connection.execute("SELECT name, digest, signature FROM seals")
-    return {name: (digest, is_signature(str(text), _seal_text(name, digest))) for name, digest, text in seals}
+    return {name: Seal(digest, is_signature(str(text), _seal_text(name, digest))) for name, digest, text in seals}
 
 
 def _seal_text(name: str, digest: str) -> bytes:
@@ -89,7 +97,7 @@ def find_broken_link(connection: sqlite3.Connection, about: Mapping[str, str]) -
         return f"the row of case {added} was added or moved"
     seal = read_seals(connection).get(ROWS)
     # kinds of columns that are left belong to entries that were removed
-    if seal is None or seal[0] != head.hex() or kinds:
+    if seal is None or seal.digest != head.hex() or kinds:
         return f"rows after that of case {last_case} were removed" if rows else "rows were removed"
     return ""
 

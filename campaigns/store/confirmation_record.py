@@ -20,6 +20,7 @@ from marsyard.campaigns.definition.claims import DEFINITION, Confirmation, Froze
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
 
+#: Kinds of entries of the chain; entries of earlier versions, which can precede it, have none.
 _KINDS = ("chain", "start", "extension", "result")
 #: Keys of the start of a confirmation; those of earlier versions have no `claim`.
 _START_KEYS = ("campaign", "number", "seed", "started_utc", "git_commit", "folder", "cases")
@@ -67,13 +68,12 @@ def parse_record(path: Path, content: bytes) -> ConfirmationRecord:
         try:
             stored = json.loads(line)
             kind = stored.get("entry")
-            is_valid = line.endswith(b"\n") and (kind is None if not is_chained and kind != "chain" else kind in _KINDS)
-            if not is_valid:
+            if not line.endswith(b"\n") or kind not in (_KINDS if is_chained else (None, "chain")):
                 raise ValueError("damaged line, or entry outside of the chain")
             if kind is None:
                 _add_former_entry(entries, stored)
                 continue
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError(f"{location} is not an entry of a record of confirmations") from error
         if stored.get("previous") != head:
             raise StoreError(f"{location}: the chain of hashes is broken: an earlier entry was changed or removed")

@@ -125,18 +125,21 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
             _check_repetition(definition.total_cases, definition.max_cases, seeds.resumed)
     return Evidence(
         EvidenceKind.CONFIRMATION,
-        seeds.number,
-        frozen.claim,
-        str(path.resolve()),
-        registration,
-        campaign.calibration_overlap,
-        uses_imported_terrain(campaign),
+        number=seeds.number,
+        claim=frozen.claim,
+        record=str(path.resolve()),
+        registration=registration,
+        overlap=campaign.calibration_overlap,
+        imported_terrain=uses_imported_terrain(campaign),
     )
 
 
 def _check_repetition(cases: int, max_cases: int | None, entry: Confirmation) -> None:
-    """Raise CampaignError if a run has not the number of cases of the unfinished confirmation that it repeats."""
-    if (max_cases, cases) == (entry.max_cases, entry.cases) or (max_cases == entry.max_cases is not None):
+    """Raise CampaignError if a run has not the number of cases of the unfinished confirmation that it repeats.
+
+    With `--until-decided`, this number is the maximum: the entry announces the cases of the looks until now.
+    """
+    if max_cases == entry.max_cases and (max_cases is not None or cases == entry.cases):
         return
     option = f"-n {entry.cases}" if entry.max_cases is None else f"-n {entry.max_cases} --until-decided"
     raise CampaignError(

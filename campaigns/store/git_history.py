@@ -1,4 +1,4 @@
-"""What git shows: the commit of the program, and that no entry of a record of confirmations was removed.
+"""Commit of the program, and the proof by git that no entry of a record of confirmations was removed.
 
 A record is registered if it is committed to a git repository, and every version of a record in the history of all
 branches is a beginning of the present file. A record that was deleted, replaced or shortened after a commit is
@@ -17,6 +17,7 @@ from marsyard.campaigns.definition.campaign import CONFIRMATIONS_FILE
 UNKNOWN = "No record of earlier runs is known here"
 #: Time limit of one call of git, s.
 _TIMEOUT_S = 60.0
+#: Folder of the program, with `scenarios`.
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 

@@ -34,6 +34,7 @@ class ProductSelection:
         return any(compute_margin(row, requirement) < 0.0 for requirement in self.requirements)
 
 
+#: Products of every case, without and with the timeline.
 ALL_PRODUCTS = ProductSelection(every=1)
 REPLAYED_PRODUCTS = ProductSelection(every=1, timelines=True)
 

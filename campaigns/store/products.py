@@ -25,8 +25,8 @@ from marsyard.sim.files import report_damage
 _ARRAY_KEY = "__array__"
 #: Folder of the stored products, with a folder for each case.
 CASES_FOLDER = "cases"
-#: File of the products with references in place of their arrays.
-_OUTLINE_FILE = "products.json"
+#: Files of the products with references in place of their arrays, and of the arrays.
+_OUTLINE_FILE, _ARRAYS_FILE = "products.json", "products.npz"
 #: Types of arrays that `write_stages` writes as images.
 _PIXEL_TYPES = (np.uint8, np.uint16)
 
@@ -76,7 +76,7 @@ def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any])
 def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
     """Write packed products and the row of their case into an existing folder. Raises OSError on failure."""
     (folder / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
-    (folder / "products.npz").write_bytes(packed.arrays)
+    (folder / _ARRAYS_FILE).write_bytes(packed.arrays)
     (folder / _OUTLINE_FILE).write_bytes(packed.outline)
 
 
@@ -140,7 +140,7 @@ def load_products(directory: Path) -> dict[str, Any]:
     Raises StoreError if there are none.
     """
     with report_damage(directory, StoreError, "contains no products of a case"):
-        files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
+        files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, _ARRAYS_FILE)]
         return unpack_products(PackedProducts(*files))
 
 

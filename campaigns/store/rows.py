@@ -87,9 +87,8 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise StoreError(f"{path} cannot be opened: {error}") from error
         execute = self._connection.execute
         try:
-            (application,), (version,) = (
-                execute(f"PRAGMA {key}").fetchone() for key in ("application_id", "user_version")
-            )
+            (application,) = execute("PRAGMA application_id").fetchone()
+            (version,) = execute("PRAGMA user_version").fetchone()
             if application != _APPLICATION_ID:
                 raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:
@@ -222,27 +221,28 @@ class RowStore(AbstractContextManager["RowStore"]):
     @property
     def is_signed(self) -> bool:
         """Whether this user's installation stored the last rows."""
-        return self._seals().get(chain.ROWS, ("", False))[1]
+        seal = self._seals().get(chain.ROWS)
+        return seal is not None and seal.is_own
 
     def sign(self) -> None:
         """Sign the last head and the table, which this user trusts although another one stored them."""
         seals = self._seals()
         with self._transaction():
-            for name, (digest, _) in seals.items():
-                chain.write_seal(self._connection, name, digest)
+            for name, seal in seals.items():
+                chain.write_seal(self._connection, name, seal.digest)
 
     @property
     def table_digest(self) -> str | None:
         """SHA-256 of the table's file that was written from the rows; None without one, or if another user wrote it."""
-        digest, is_own = self._seals().get(chain.TABLE, (None, False))
-        return digest if is_own or not self.is_signed else None
+        seal = self._seals().get(chain.TABLE)
+        return seal.digest if seal is not None and (seal.is_own or not self.is_signed) else None
 
     def record_table(self, digest: str) -> None:
         """Record the SHA-256 of the table's file that was written from the rows."""
         with self._transaction():
             chain.write_seal(self._connection, chain.TABLE, digest)
 
-    def _seals(self) -> dict[str, tuple[str, bool]]:
+    def _seals(self) -> dict[str, chain.Seal]:
         try:
             return chain.read_seals(self._connection)
         except sqlite3.Error as error:

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
-from marsyard.campaigns.definition.parameter_paths import value_at
+from marsyard.campaigns.definition.parameter_paths import paths_overlap, value_at
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
@@ -37,6 +37,8 @@ from marsyard.sim.streams import Streams
 STREAMS = "random streams"
 #: Number of base cases that are evaluated together.
 _BATCH = 8
+#: Minimum number of complete base samples for Sobol's indices, and number of resamples for their intervals.
+_MIN_SAMPLES, _RESAMPLES = 8, 500
 
 
 @dataclass(frozen=True)
@@ -70,24 +72,38 @@ def start_budget(
         if not error_sources(scenario):
             reason = f"has the scenario '{scenario}', which names no sources of error"
         raise CampaignError(f"campaign '{campaign.definition.name}' {reason}; allowed: --sobol N")
-    # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
     n_cases = parameters.cases * len(list_variants(sources)) if sources else 0
-    n_cases += parameters.sobol * (len(campaign.drawn_paths) + 3) if parameters.sobol else 0
+    n_cases += parameters.sobol * _cases_per_sample(len(_list_variables(campaign)))
     session = StudySession(BUDGET, parameters, BudgetStudy, executor, observer)
     return start_study(campaign, n_cases, directory, session)
+
+
+def _list_variables(campaign: Campaign) -> list[str]:
+    """List the variables of Saltelli's design: the dispersions and the random streams."""
+    return [*campaign.drawn_paths, STREAMS]
+
+
+def _cases_per_sample(variables: int) -> int:
+    """Return the number of cases per base sample of Saltelli's design without second order (SALib's layout)."""
+    return variables + 2
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:
     """Return the sources of error that act in the campaign, and the titles of the other sources.
 
-    A source acts if one of its parameters is dispersed, or differs from its value without the error.
+    A source acts if one of its parameters is dispersed, alone or in a table, or differs from its value without the
+    error.
     """
-    parameters, dispersed = campaign.definition.parameters, campaign.definition.dispersions
+    parameters = campaign.definition.parameters
+
+    def is_dispersed(path: str) -> bool:
+        return any(paths_overlap(path, name) for name in campaign.definition.dispersions)
+
     active: list[ScenarioSource] = []
     inactive: list[str] = []
     for source in error_sources(campaign.definition.scenario):
         exact = source.exact_values(parameters)
-        is_active = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
+        is_active = any(is_dispersed(path) or value_at(parameters, path) != value for path, value in exact.items())
         if is_active:
             active.append(source)
         else:
@@ -128,7 +144,8 @@ class BudgetStudy:
                 observer.begin("cases", n * parameters.cases)
                 errors, groups, violations = self._run_variants(variants)
             if parameters.sobol:
-                observer.begin("cases of Saltelli's design", parameters.sobol * (len(self._campaign.drawn_paths) + 3))
+                cases = parameters.sobol * _cases_per_sample(len(_list_variables(self._campaign)))
+                observer.begin("cases of Saltelli's design", cases)
                 indices, index_samples = self._run_design()
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
@@ -141,16 +158,16 @@ class BudgetStudy:
                 "terrain, or all errors are equal."
             )
         return BudgetResult(
-            self._quantity,
-            self._is_centred,
-            self._inactive,
-            budget,
-            parameters.cases if n else 0,
-            violations,
-            indices,
-            index_samples,
-            self._runner.n_cases,
-            reason,
+            quantity=self._quantity,
+            centred=self._is_centred,
+            inactive=self._inactive,
+            budget=budget,
+            cases=parameters.cases if n else 0,
+            violations=violations,
+            indices=indices,
+            index_samples=index_samples,
+            evaluated=self._runner.n_cases,
+            reason=reason,
         )
 
     @property
@@ -202,14 +219,14 @@ class BudgetStudy:
 
         The random streams are one variable: a uniform number selects their number.
         """
-        paths = [*self._campaign.drawn_paths, STREAMS]
+        paths = _list_variables(self._campaign)
         problem = {"num_vars": len(paths), "names": paths, "bounds": [[0.0, 1.0]] * len(paths)}
         seed = int(self._generator("Saltelli's design").integers(2**31))
         uniform = sobol_design.sample(problem, self._parameters.sobol, calc_second_order=False, seed=seed)
         coordinates = ndtri(np.clip(uniform[:, :-1], MIN_DRAW, MAX_DRAW))
         streams = np.minimum(uniform[:, -1] * 2.0**31, 2.0**31 - 1.0).astype(np.int64)
         errors: list[float] = []
-        block = len(paths) + 2
+        block = _cases_per_sample(len(paths))
         for first in range(0, len(uniform), block):
             cases = range(first, first + block)
             rows = self._runner.run([StudyPoint(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
@@ -225,12 +242,12 @@ def compute_indices(
     Base samples with a missing error in any of their cases are omitted. No indices for fewer than 8 samples, or if all
     errors are equal.
     """
-    blocks = errors.reshape(-1, problem["num_vars"] + 2)
+    blocks = errors.reshape(-1, _cases_per_sample(problem["num_vars"]))
     complete = blocks[np.isfinite(blocks).all(axis=1)]
-    if len(complete) < 8 or np.ptp(complete) == 0.0:
+    if len(complete) < _MIN_SAMPLES or np.ptp(complete) == 0.0:
         return (), len(complete)
     values = sobol_indices.analyze(
-        problem, complete.ravel(), calc_second_order=False, conf_level=confidence, num_resamples=500, seed=seed
+        problem, complete.ravel(), calc_second_order=False, conf_level=confidence, num_resamples=_RESAMPLES, seed=seed
     )
     indices = [
         SobolIndex(name, *(float(values[key][index]) for key in ("S1", "S1_conf", "ST", "ST_conf")))

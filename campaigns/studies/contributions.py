@@ -25,6 +25,9 @@ MIN_COMMON = 10
 _RESAMPLES = 2000
 #: Minimum standard error relative to the estimate; below it, an output is constant except for rounding errors.
 _MIN_RELATIVE_ERROR = 1e-9
+#: Rows of the errors by variant: with all sources and with none; the rows without each source begin at the last number,
+#: and those with each source alone follow them (`marsyard.campaigns.studies.budget.list_variants`).
+_ALL, _NONE, _FIRST_WITHOUT = 0, 1, 2
 #: Function of the weights of the groups: estimates, and their standard errors.
 Evaluate = Callable[
     [Float64[np.ndarray, " groups"]], tuple[Float64[np.ndarray, " outputs"], Float64[np.ndarray, " outputs"]]
@@ -99,30 +102,32 @@ def compute_budget(
     mean_squares = _MeanSquares.from_errors(errors[:, is_common], groups[is_common], is_centred)
     n_groups = mean_squares.sizes.size
     squares = mean_squares.evaluate(np.ones(n_groups))[0]
-    if n_groups < 2 or squares[0] <= 0.0:
+    if n_groups < 2 or squares[_ALL] <= 0.0:
         return None
-    total, without_sources = float(squares[0]), float(squares[1])
-    removed, alone = total - squares[2 : 2 + n_sources], squares[2 + n_sources :] - without_sources
+    without = _FIRST_WITHOUT + np.arange(n_sources)
+    only = without + n_sources
+    total, without_sources = float(squares[_ALL]), float(squares[_NONE])
+    removed, alone = total - squares[without], squares[only] - without_sources
     # rows: mean of `removed` and `alone` of each source, mean square with all sources, and closure times this
     combinations = np.zeros((n_sources + 2, len(squares)))
     for index in range(n_sources):
-        combinations[index, [0, 1, 2 + index, 2 + n_sources + index]] = 0.5, -0.5, -0.5, 0.5
-    combinations[n_sources, 0] = 1.0
+        combinations[index, [_ALL, without[index], only[index], _NONE]] = 0.5, -0.5, 0.5, -0.5
+    combinations[n_sources, _ALL] = 1.0
     combinations[n_sources + 1] = combinations[:n_sources].sum(axis=0)
-    combinations[n_sources + 1, 1] += 1.0
+    combinations[n_sources + 1, _NONE] += 1.0
     mean = combinations[:n_sources] @ squares
     lower, upper = studentized_intervals(partial(_combine, mean_squares, combinations), n_groups, confidence)
     counts = has_error.sum(axis=1)
     contributions = [
         Contribution(
-            source.name,
-            source.title,
-            float(alone[index]),
-            float(removed[index]),
-            float(mean[index]),
-            float(lower[index]),
-            float(upper[index]),
-            (int(counts[2 + index]), int(counts[2 + n_sources + index])),
+            source=source.name,
+            title=source.title,
+            alone=float(alone[index]),
+            removed=float(removed[index]),
+            mean=float(mean[index]),
+            lower=float(lower[index]),
+            upper=float(upper[index]),
+            answered=(int(counts[without[index]]), int(counts[only[index]])),
         )
         for index, source in enumerate(sources)
     ]
@@ -180,11 +185,11 @@ def _combine(
     The last output is divided by the first mean square.
     """
     squares, influence = mean_squares.evaluate(weights)
-    total = max(squares[0], np.finfo(np.float64).tiny)  # 0 if a resample contains only one group
+    total = max(squares[_ALL], np.finfo(np.float64).tiny)  # 0 if a resample contains only one group
     outputs, slopes = combinations @ squares, combinations.copy()
     outputs[-1] /= total
     slopes[-1] /= total
-    slopes[-1, 0] -= outputs[-1] / total
+    slopes[-1, _ALL] -= outputs[-1] / total
     n_groups = len(influence)
     variances = n_groups / (n_groups - 1.0) * weights @ (influence @ slopes.T) ** 2
     return outputs, np.sqrt(variances)

@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.stats import beta
 
-#: Maximum number of units that a study can need.
-_MAX_UNITS = 10**9
+from marsyard.campaigns.definition.campaign_file import MAX_CASES
+
+#: Maximum number of units: that of the cases of a campaign.
+MAX_UNITS = MAX_CASES
 
 
 @dataclass(frozen=True)
@@ -61,22 +63,25 @@ def count_violations(
     violating_units = len(np.unique(unit_of_case[is_violation]))
     lower = float(beta.ppf(lower_risk, first_violations, units - first_violations + 1)) if first_violations else 0.0
     return CountingBound(
-        len(is_violation),
-        int(is_violation.sum()),
-        units,
-        violating_units,
-        first_violations,
-        lower,
-        _upper_bound(violating_units, units, upper_risk),
-        1.0 - lower_risk,
-        1.0 - upper_risk,
+        cases=len(is_violation),
+        violations=int(is_violation.sum()),
+        units=units,
+        violating_units=violating_units,
+        first_violations=first_violations,
+        lower=lower,
+        upper=_upper_bound(violating_units, units, upper_risk),
+        lower_confidence=1.0 - lower_risk,
+        upper_confidence=1.0 - upper_risk,
     )
 
 
 def find_units_needed(violating_units: int, max_probability: float, upper_risk: float) -> int:
-    """Find the number of units whose upper bound is at most the limit, for a number of units with a violation."""
+    """Find the number of units whose upper bound is at most the limit, for a number of units with a violation.
+
+    `MAX_UNITS` if fewer are not sufficient.
+    """
     return bisect.bisect_left(
-        range(_MAX_UNITS), True, key=lambda units: _upper_bound(violating_units, units, upper_risk) <= max_probability
+        range(MAX_UNITS), True, key=lambda units: _upper_bound(violating_units, units, upper_risk) <= max_probability
     )
 
 

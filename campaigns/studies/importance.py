@@ -24,20 +24,20 @@ _MAX_CLUSTERS, _MIN_VIOLATIONS = 4, 10
 
 @dataclass(frozen=True)
 class ImportanceDensity:
-    """Sampling density in standard normal space: weights and centres of the shifted densities."""
+    """Sampling density in standard normal space: fractions and centres of the shifted densities."""
 
-    weights: Float64[np.ndarray, " clusters"]
+    fractions: Float64[np.ndarray, " clusters"]
     centres: Float64[np.ndarray, "clusters dimensions"]
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[Coordinates, Float64[np.ndarray, " n"]]:
         """Draw n cases; return their coordinates and weights (nominal density divided by sampling density)."""
         coordinates = rng.standard_normal((n, self.centres.shape[1]))
         shifted_cases = np.flatnonzero(rng.random(n) >= NOMINAL_FRACTION)
-        clusters = rng.choice(len(self.weights), shifted_cases.size, p=self.weights)
+        clusters = rng.choice(len(self.fractions), shifted_cases.size, p=self.fractions)
         coordinates[shifted_cases] += self.centres[clusters]
         # phi(z - c) / phi(z) = exp(z c - c^2 / 2) for the standard normal density phi and the centre c
         log_ratios = coordinates @ self.centres.T - 0.5 * np.sum(self.centres**2, axis=1)
-        log_mixture_ratio = logsumexp(log_ratios, axis=1, b=self.weights)
+        log_mixture_ratio = logsumexp(log_ratios, axis=1, b=self.fractions)
         return coordinates, 1.0 / (NOMINAL_FRACTION + (1.0 - NOMINAL_FRACTION) * np.exp(log_mixture_ratio))
 
 

@@ -19,8 +19,8 @@ class ProbabilityInterval:
 
     - estimate, lower, upper: probability, and bounds of the interval
     - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
-    - log_sd: stored for the reader only, since its meaning depends on the function: the standard deviation of the
-      logarithm of one replicate (`replicate_interval`), or of the mean of all cases (`weighted_interval`)
+    - log_sd: standard deviation of a logarithm, for the reader: of the estimate of one replicate
+      (`replicate_interval`), or of the mean of all cases (`weighted_interval`)
     """
 
     estimate: Number
@@ -67,10 +67,10 @@ def additional_replicates(estimates: Sequence[float], confidence: float, max_pro
 
     None if the estimate is so close to the limit that fewer than `_MAX_REPLICATES` do not decide.
     """
-    present = replicate_interval(estimates, confidence)
-    distance = abs(math.log(max_probability / present.estimate))
+    variance = float(np.log(estimates).var(ddof=1))
+    distance = abs(math.log(max_probability / float(np.mean(estimates))))
     for count in range(len(estimates) + 1, _MAX_REPLICATES if distance > 0.0 else 0):
-        if _log_half_width(present.log_sd**2, count, confidence) <= distance:
+        if _log_half_width(variance, count, confidence) <= distance:
             return count - len(estimates)
     return None
 

@@ -16,7 +16,7 @@ give the noise of the instruments. `NEW_STREAM` is the stream that the case crea
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,12 +127,12 @@ class _RareStudy:
             Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
         )
         return RareResult(
-            decision.verdict,
-            decision,
-            self._runner.n_cases,
-            self._violations,
-            replicates_run,
-            describe_margin(self._requirement),
+            verdict=decision.verdict,
+            decision=decision,
+            cases=self._runner.n_cases,
+            violations=self._violations,
+            replicates=replicates_run,
+            margin_text=describe_margin(self._requirement),
         )
 
     def _max_cases(self, replicates: int) -> int:
@@ -148,7 +148,7 @@ class _RareStudy:
         for first in range(0, count, _RANDOM_BATCH):
             batch = coordinates[first : first + _RANDOM_BATCH]
             self._reserved_cases -= len(batch)
-            list(self._evaluate([subset.Proposals(batch, [subset.new_blend()] * len(batch), is_independent=True)]))
+            self._evaluate([subset.Proposals(batch, [subset.new_blend()] * len(batch), is_independent=True)])
 
     def _run_replicates(self, numbers: range) -> list[subset.SubsetResult]:
         """Run subset simulations in parallel: the next cases of all of them are evaluated together."""
@@ -193,8 +193,11 @@ class _RareStudy:
             violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return violation_weights
 
-    def _evaluate(self, proposals: Sequence[subset.Proposals]) -> Iterator[subset.Evaluated]:
-        """Evaluate several groups of proposed cases together; yield the margins of each group."""
+    def _evaluate(self, proposals: Sequence[subset.Proposals]) -> list[subset.Evaluated]:
+        """Evaluate several groups of proposed cases together; return the margins of each group.
+
+        Counts the violations, and records the independent cases for the counting bound.
+        """
         coordinates = np.concatenate([group.coordinates for group in proposals])
         blends = [blend for group in proposals for blend in group.blends]
         first = self._runner.n_cases
@@ -207,13 +210,15 @@ class _RareStudy:
         self._violations += int(np.sum(margins < 0.0))
         numbered = [number_blend(blend, case) for case, blend in enumerate(blends, start=first)]
         ends = np.cumsum([len(group.blends) for group in proposals])
+        evaluated: list[subset.Evaluated] = []
         for group, start, end in zip(proposals, [0, *ends[:-1]], ends, strict=True):
             if group.is_independent:
                 self._is_violation += (margins[start:end] < 0.0).tolist()
                 self._terrains += [
                     None if (name := row.get("terrain")) is None else str(name) for row in rows[start:end]
                 ]
-            yield subset.Evaluated(numbered[start:end], margins[start:end])
+            evaluated.append(subset.Evaluated(numbered[start:end], margins[start:end]))
+        return evaluated
 
     def _generator(self, name: str) -> np.random.Generator:
         """Create a random generator of the study, which does not depend on the cases."""

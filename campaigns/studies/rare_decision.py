@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.stats import poisson
 
-from marsyard.campaigns.studies.counting import CountingBound, count_violations, find_units_needed
+from marsyard.campaigns.studies.counting import MAX_UNITS, CountingBound, count_violations, find_units_needed
 from marsyard.campaigns.studies.interval import (
     ProbabilityInterval,
     additional_replicates,
@@ -129,7 +129,8 @@ class Decision:
     - effective_violations: effective number of violations of importance sampling; None without it
     - continuity: check of the estimate; None without an estimate
     - reason: why the verdict is INSUFFICIENT; may be empty
-    - additional_random_cases: number of further independent cases without a violation until PASS; None if unsuitable
+    - additional_random_cases: number of further independent cases without a violation until PASS; None if unsuitable or
+      too large
     - additional_replicates: estimated number of further replicates until FAIL; None if unsuitable or unknown
     """
 
@@ -173,7 +174,7 @@ def decide_rare(sample: RareSample, max_probability: float, confidence: float, e
         further = additional_replicates(sample.estimates, 1.0 - next_risk, max_probability)
         return replace(undecided, additional_replicates=further)
     needed = find_units_needed(counting.violating_units, max_probability, next_risk)
-    return replace(undecided, additional_random_cases=needed - counting.units)
+    return replace(undecided, additional_random_cases=needed - counting.units) if needed < MAX_UNITS else undecided
 
 
 def _evaluation_risk(confidence: float, evaluation: int) -> float:

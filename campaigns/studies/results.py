@@ -16,7 +16,7 @@ METHODS = ("subset", "importance")
 
 @dataclass(frozen=True)
 class RareParameters:
-    """Parameters of the study.
+    """Parameters of the study `rare`.
 
     - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
     - method: see `METHODS`
@@ -64,7 +64,7 @@ class Replicate:
 
 @dataclass(frozen=True)
 class RareResult:
-    """Result of the study.
+    """Result of the study `rare`.
 
     - verdict, decision: verdict, and its evidence
     - cases, violations: numbers of evaluated cases, and of those that violate the requirement
@@ -90,7 +90,7 @@ RARE = StudyKind("rare", "a study of rare violations (marsyard rare)", RareParam
 
 @dataclass(frozen=True)
 class SearchParameters:
-    """Parameters of the study.
+    """Parameters of the study `search`.
 
     - requirement: id of the requirement
     - cases: number of cases of exploration and evolution strategies
@@ -121,7 +121,7 @@ class FoundFailure:
 
     - case: number of the reduced case; original_case: number of the case before the reduction
     - margin: margin of the reduced case
-    - values: values of the dispersions that differ from the campaign's parameters, and of numbers `in-turn`, by path
+    - values: values of the dispersions that replace the campaign's parameters in the case, by path
     - distance: distance of these values from the medians, standard deviations; small distances are more likely
     - similar: number of violations with the same cause
     - repeated, repetitions: number of violations among the repetitions with new random streams and numbers `in-turn`
@@ -141,7 +141,7 @@ class FoundFailure:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of the study: reduced violations, the most likely one first, and numbers of cases.
+    """Result of the study `search`: reduced violations, the most likely one first, and numbers of cases.
 
     - search_cases, cases: numbers of cases before the reduction, and in all
     - violations: number of violations among the cases before the reduction; min_margin: their smallest margin
@@ -168,7 +168,7 @@ SEARCH = StudyKind("search", "a search for violations (marsyard search)", Search
 
 @dataclass(frozen=True)
 class BudgetParameters:
-    """Parameters of the study.
+    """Parameters of the study `budget`.
 
     - requirement: id of the requirement whose metric is the error; without a bound, its margin is used
     - cases: number of base cases; each runs once per variant
@@ -205,7 +205,7 @@ class SobolIndex:
 
 @dataclass(frozen=True)
 class BudgetResult:
-    """Result of the study.
+    """Result of the study `budget`.
 
     - quantity: metric or margin that is the error; centred: whether its mean square is taken about the mean
     - inactive: titles of the sources that act in no case of the campaign
@@ -251,7 +251,7 @@ class RobustVariant:
 
 @dataclass(frozen=True)
 class RobustParameters:
-    """Parameters of the study.
+    """Parameters of the study `robust`.
 
     - variants: named variants, and steps of parameters in increasing distance from the assumed value
     - cases, weights: cases of the run that each variant repeats, and the number of its cases that each represents
@@ -264,7 +264,7 @@ class RobustParameters:
 
 @dataclass(frozen=True)
 class RobustResult:
-    """Result of the study: number of cases that were run."""
+    """Result of the study `robust`: number of cases that were run."""
 
     cases: int
 
@@ -280,7 +280,7 @@ ROBUST = StudyKind("robust", "cases of other parameters (marsyard robust)", Robu
 
 
 def _check(conditions: Mapping[str, bool]) -> None:
-    """Raise CampaignError with the message of a condition that is not met."""
+    """Raise CampaignError for the first condition that is not met; the keys are the messages."""
     for message, is_met in conditions.items():
         if not is_met:
             raise CampaignError(message)

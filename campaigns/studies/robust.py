@@ -131,6 +131,8 @@ def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVa
         raise CampaignError(f"{option}: {error}") from error
     if isinstance(assumed, bool) or not isinstance(assumed, int | float):
         raise CampaignError(f"{option}: its value in the campaign is {assumed!r}; allowed: parameters with a number")
+    if isinstance(assumed, int) and not float(farthest).is_integer():
+        raise CampaignError(f"{option}: its value in the campaign is {assumed}; allowed: whole numbers")
     if farthest == assumed:
         raise CampaignError(f"{option}: this is its value in the campaign; give the farthest value to be examined")
     values = [assumed + (farthest - assumed) * step / STEPS for step in range(1, STEPS + 1)]
@@ -142,7 +144,11 @@ def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVa
 
 
 def _check_values(campaign: Campaign, variant: RobustVariant) -> None:
-    """Raise CampaignError if the scenario rejects the values of a variant."""
+    """Raise CampaignError if the scenario rejects the values of a variant, or sampled tables would replace them."""
+    for path in variant.values:
+        table = next((name for name in campaign.definition.dispersions if path.startswith(f"{name}.")), None)
+        if table is not None:
+            raise CampaignError(f"{variant.name}: its table '{table}' is dispersed as a whole")
     try:
         campaign.with_values(variant.values)
     except (ValidationError, ValueError, KeyError) as error:

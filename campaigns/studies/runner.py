@@ -144,6 +144,7 @@ def _run_study(campaign: Campaign, directory: Path, session: StudySession[Any, R
                 runner = PointRunner(campaign, directory, store, executor, observer)
                 result: Result = session.study(campaign, session.parameters, runner).run(observer)
         finally:
+            # the study is finished only when its table and its result are written, below
             counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
             record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
         write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.definition.requirements))
@@ -153,7 +154,7 @@ def _run_study(campaign: Campaign, directory: Path, session: StudySession[Any, R
 
 
 def check_identity(campaign: Campaign, directory: Path) -> None:
-    """Raise CampaignError if program, definition or input files differ from those of the stored study."""
+    """Raise CampaignError if program, definition or input files differ from those of a stored study or campaign."""
     changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.definition))
     if changes:
         text = "\n  ".join(changes)

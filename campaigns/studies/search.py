@@ -8,26 +8,25 @@
    same random streams.
 4. Violations that are close to a reduced one in its remaining dispersions have the same cause. Step 3 is repeated with
    the other violations.
-
-`write_regression_campaigns` writes the reduced violations as campaigns.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cma
 import numpy as np
-import tomli_w
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
-from marsyard.campaigns.errors import report_write_errors
+from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
@@ -50,7 +49,7 @@ _REDUCTION_CASES = 25
 _BISECTION_STEPS = 4
 
 
-@dataclass
+@dataclass(frozen=True)
 class _EvaluatedPoint:
     """An evaluated case: its number, point, margin and outcome."""
 
@@ -58,6 +57,18 @@ class _EvaluatedPoint:
     point: StudyPoint
     margin: float
     outcome: str
+
+
+class _Cause(NamedTuple):
+    """Dispersions that remain in a reduced violation, and their standard normal coordinates."""
+
+    paths: list[str]
+    coordinates: np.ndarray
+
+    def is_similar(self, other: _Cause) -> bool:
+        """Whether another reduced violation has the same dispersions, with similar coordinates."""
+        distance = np.linalg.norm(self.coordinates - other.coordinates) if self.paths == other.paths else math.inf
+        return float(distance) <= _MAX_CAUSE_DISTANCE
 
 
 def start_search(
@@ -91,29 +102,27 @@ class SearchStudy:
         observer.begin("search", self.parameters.cases)
         failures: list[FoundFailure] = []
         reason = ""
-        n_searched = violations = 0
+        n_searched: int | None = None
         try:
             self._explore()
             self._evolve()
             n_searched = len(self._evaluated)
             violating_cases = [item for item in self._evaluated if item.margin < 0.0]
-            violations = len(violating_cases)
-            observer.begin("reduction", _REDUCTION_CASES * min(violations, self.parameters.max_failures))
+            observer.begin("reduction", _REDUCTION_CASES * min(len(violating_cases), self.parameters.max_failures))
             self._reduce_all(violating_cases, failures)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
-            n_searched = n_searched or len(self._evaluated)
-        searched_cases = self._evaluated[:n_searched]
+        searched_cases = self._evaluated[:n_searched]  # all if the limit ended the search itself
         violation_numbers = [index + 1 for index, item in enumerate(searched_cases) if item.margin < 0.0]
         return SearchResult(
-            tuple(sorted(failures, key=lambda failure: failure.distance)),
-            n_searched,
-            self.runner.n_cases,
-            violations or len(violation_numbers),
-            min((item.margin for item in searched_cases), default=math.nan),
-            violation_numbers[0] if violation_numbers else None,
-            describe_margin(self._requirement),
-            reason,
+            failures=tuple(sorted(failures, key=lambda failure: failure.distance)),
+            search_cases=len(searched_cases),
+            cases=self.runner.n_cases,
+            violations=len(violation_numbers),
+            min_margin=min((item.margin for item in searched_cases), default=math.nan),
+            first_violation=violation_numbers[0] if violation_numbers else None,
+            margin_text=describe_margin(self._requirement),
+            reason=reason,
         )
 
     def _evaluate(self, points: Sequence[StudyPoint]) -> list[_EvaluatedPoint]:
@@ -148,23 +157,21 @@ class SearchStudy:
 
     def _evolve(self) -> None:
         """Run evolution strategies in parallel until the cases are used."""
-        parameters, starts = self.parameters, self._select_starts()
+        parameters = self.parameters
+        options = {
+            "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
+            "verbose": -9,  # no output
+            "verb_log": 0,  # no log files
+            # margins are noisy, and equal margins are usual
+            "tolfun": 0.0,
+            "tolfunhist": 0.0,
+            "tolflatfitness": 10**6,
+        }
+        if len(self.campaign.drawn_paths) == 1:
+            options["maxstd_boundrange"] = math.inf  # `cma` raises an exception at this limit in one dimension
         strategies = [
-            cma.CMAEvolutionStrategy(
-                list(start),
-                _STEP,
-                {
-                    "seed": self._seed(f"strategy {number}"),
-                    "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
-                    "verbose": -9,
-                    "verb_log": 0,
-                    # margins are noisy, and equal margins are usual
-                    "tolfun": 0.0,
-                    "tolfunhist": 0.0,
-                    "tolflatfitness": 10**6,
-                },
-            )
-            for number, start in enumerate(starts)
+            cma.CMAEvolutionStrategy(list(start), _STEP, {"seed": self._seed(f"strategy {number}"), **options})
+            for number, start in enumerate(self._select_starts())
         ]
         size = strategies[0].popsize
         while self.runner.n_cases + size * len(strategies) <= parameters.cases:
@@ -193,46 +200,45 @@ class SearchStudy:
         failures: receives the reduced violations, also those before a CaseLimitError
         """
         remaining = sorted(violating_cases, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
-        reduced_points: list[tuple[list[str], np.ndarray]] = []
+        causes: list[_Cause] = []
         while remaining and len(failures) < self.parameters.max_failures:
             first = remaining[0]
             reduction = self._shrink(self._remove_dispersions(first))
             paths = [path for path in self.campaign.drawn_paths if path not in reduction.point.nominal]
             indices = [self.campaign.drawn_paths.index(path) for path in paths]
-            reduced_coordinates = np.array(reduction.point.coordinates)[indices]
+            cause = _Cause(paths, np.array(reduction.point.coordinates)[indices])
             coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
             has_same_cause = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
             remaining = [item for item, is_similar in zip(remaining, has_same_cause, strict=True) if not is_similar]
-            values = self.campaign.draws_at(reduction.point)
-            failure_index = next(
-                (
-                    index
-                    for index, other in enumerate(reduced_points)
-                    if _have_same_cause(reduced_coordinates, paths, other)
-                ),
-                None,
-            )
-            if failure_index is not None:
-                failures[failure_index] = replace(
-                    failures[failure_index], similar=failures[failure_index].similar + int(has_same_cause.sum())
-                )
+            known = next((index for index, other in enumerate(causes) if cause.is_similar(other)), None)
+            if known is not None:
+                similar = failures[known].similar + int(has_same_cause.sum())
+                failures[known] = replace(failures[known], similar=similar)
                 continue
-            reduced_points.append((paths, reduced_coordinates))
+            causes.append(cause)
             repetition = StudyPoint(reduction.point.coordinates, nominal=reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.parameters.repetitions)
             failures.append(
                 FoundFailure(
-                    reduction.case,
-                    first.case,
-                    reduction.margin,
-                    {path: values[path] for path in (*paths, *self.campaign.cyclic_paths)},
-                    float(np.linalg.norm(reduced_coordinates)),
-                    int(has_same_cause.sum()),
-                    sum(item.margin < 0.0 for item in repetitions),
-                    len(repetitions),
-                    reduction.outcome,
+                    case=reduction.case,
+                    original_case=first.case,
+                    margin=reduction.margin,
+                    values=self._changed_values(reduction.point),
+                    distance=float(np.linalg.norm(cause.coordinates)),
+                    similar=int(has_same_cause.sum()),
+                    repeated=sum(item.margin < 0.0 for item in repetitions),
+                    repetitions=len(repetitions),
+                    outcome=reduction.outcome,
                 )
             )
+
+    def _changed_values(self, point: StudyPoint) -> dict[str, Any]:
+        """Return the values of the dispersions, by path, that replace the campaign's parameters in a case."""
+        values, parameters = self.campaign.draws_at(point), self.campaign.definition.parameters
+        drawn = (*self.campaign.drawn_paths, *self.campaign.cyclic_paths)
+        # fixed and derived values, which are in every case
+        others = (path for path in values if path not in drawn and values[path] != value_at(parameters, path))
+        return {path: values[path] for path in (*drawn, *others) if path not in point.nominal}
 
     def _remove_dispersions(self, failure: _EvaluatedPoint) -> _EvaluatedPoint:
         """Reset groups of dispersions to the campaign's parameters, as long as the case remains a violation."""
@@ -262,22 +268,17 @@ class SearchStudy:
         for index, path in enumerate(self.campaign.drawn_paths):
             if path in failure.point.nominal:
                 continue
-            low, high = 0.0, failure.point.coordinates[index]
+            inner, outer = 0.0, failure.point.coordinates[index]  # the median, and a violation
             for _ in range(_BISECTION_STEPS):
-                middle = 0.5 * (low + high)
+                middle = 0.5 * (inner + outer)
                 coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
                 (trial,) = self._evaluate([StudyPoint(tuple(coordinates), failure.point.stream, failure.point.nominal)])
                 if trial.margin < 0.0:
-                    failure, high = trial, middle
+                    failure, outer = trial, middle
                 else:
-                    low = middle
+                    inner = middle
         return failure
-
-
-def _have_same_cause(coordinates: np.ndarray, paths: list[str], other: tuple[list[str], np.ndarray]) -> bool:
-    """Whether two reduced violations have the same dispersions, with similar coordinates."""
-    return paths == other[0] and float(np.linalg.norm(coordinates - other[1])) <= _MAX_CAUSE_DISTANCE
 
 
 def _replace_infinite(margins: np.ndarray) -> np.ndarray:
@@ -286,43 +287,3 @@ def _replace_infinite(margins: np.ndarray) -> np.ndarray:
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     width = max(high - low, 1.0)
     return np.asarray(np.clip(margins, low - width, high + width))
-
-
-def write_regression_campaigns(campaign: Campaign, result: SearchResult, directory: Path) -> list[Path]:
-    """Write one campaign file per reduced violation into DIR/failures, and a plan of nightly runs with all of them.
-
-    Each file has the parameters of the reduced case, no dispersions, and new random streams for each of its cases.
-    """
-    folder, paths = directory / "failures", list[Path]()
-    definition = campaign.definition
-    requirement = find_requirement(campaign, SEARCH.read_parameters(directory).requirement)
-    with report_write_errors(folder):
-        folder.mkdir(exist_ok=True)
-        for number, failure in enumerate(result.failures, start=1):
-            name = f"{definition.name}-failure-{number}"
-            values_text = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
-            tables = {
-                "name": name,
-                "scenario": definition.scenario,
-                "description": f"Violation of {requirement.id} with {values_text or 'the parameters of the campaign'}.",
-                "cases": max(failure.repetitions, 1),
-                "seed": definition.seed,
-                "parameters": campaign.with_values(failure.values).model_dump(mode="json"),
-                "requirements": [requirement.model_dump(mode="json")],
-            }
-            paths.append(folder / f"{name}.toml")
-            paths[-1].write_text(tomli_w.dumps(_without_none(tables)), encoding="utf-8")
-        plan = {"campaigns": [{"campaign": path.name} for path in paths]}
-        (folder / "nightly.toml").write_text(tomli_w.dumps(plan), encoding="utf-8")
-    return paths
-
-
-def _short_text(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _without_none(value: Any) -> Any:
-    """Remove keys without a value, which TOML cannot represent; they have their default."""
-    if isinstance(value, dict):
-        return {name: _without_none(inner) for name, inner in value.items() if inner is not None}
-    return [_without_none(inner) for inner in value] if isinstance(value, list | tuple) else value

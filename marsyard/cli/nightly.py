@@ -32,7 +32,8 @@ def nightly(
     from marsyard.campaigns.store.lock import folder_lock
     from marsyard.cli import nightly_run
     from marsyard.cli.progress import campaign_progress
-    from marsyard.reports.nightly import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
+    from marsyard.reports.night_history import FINISHED, INTERRUPTED, History
+    from marsyard.reports.nightly import find_changes, list_comparisons
 
     path = plan or nightly_run.PLAN_FILE
     plan_definition, executor = nightly_run.read_plan(path), make_executor(jobs, None)

@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import MAX_CASES
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.definition.toml_models import read_table
+from marsyard.campaigns.definition.toml_models import read_model
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
@@ -30,7 +30,8 @@ from marsyard.cli.errors import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.nightly import History, MetricChange, NightCampaign, format_night_page, list_comparisons
+from marsyard.reports.night_history import History, MetricChange, NightCampaign
+from marsyard.reports.nightly import format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters
 
 #: The plan that is installed with Marsyard.
@@ -87,7 +88,7 @@ class Plan(Parameters):
 
 def read_plan(path: Path) -> Plan:
     """Read the plan from a file. Raises DefinitionError if the file is not readable or not valid."""
-    return read_table(path, Plan)
+    return read_model(path, Plan)
 
 
 def night_seed(seed: int, night: int) -> int:

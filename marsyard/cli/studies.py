@@ -313,7 +313,7 @@ def _finish_search(directory: Path, result: SearchResult) -> NoReturn:
     from marsyard.campaigns.running.stored_campaign import load_stored_campaign
     from marsyard.campaigns.store.products import case_directory, save_packed
     from marsyard.campaigns.store.record import stored_definition
-    from marsyard.campaigns.studies.search import write_regression_campaigns
+    from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
 
     campaign = load_stored_campaign(directory, stored_definition(directory))
     files = write_regression_campaigns(campaign, result, directory)

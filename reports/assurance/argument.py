@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from html import escape
+from typing import NamedTuple
 
 
 class ElementKind(StrEnum):
@@ -60,15 +61,23 @@ def defeater(text: str, evidence: str = "", state: GoalState = GoalState.CHALLEN
     return Element(ElementKind.DEFEATER, text, evidence=evidence, own_state=state)
 
 
-def number_elements(root: Element) -> list[tuple[str, Element, str]]:
-    """List the elements in the order of the argument with their identifiers, and those of their parents."""
+class NumberedElement(NamedTuple):
+    """An element with its identifier (`G1`, for example) and that of its parent; empty for the root."""
+
+    name: str
+    element: Element
+    parent: str
+
+
+def number_elements(root: Element) -> list[NumberedElement]:
+    """List the elements in the order of the argument with their identifiers."""
     numbers = dict.fromkeys(ElementKind, 0)
-    listed: list[tuple[str, Element, str]] = []
+    listed: list[NumberedElement] = []
 
     def visit(element: Element, parent: str) -> None:
         numbers[element.kind] += 1
         name = f"{element.kind}{numbers[element.kind]}"
-        listed.append((name, element, parent))
+        listed.append(NumberedElement(name, element, parent))
         for child in element.children:
             visit(child, name)
 
@@ -80,7 +89,10 @@ def number_elements(root: Element) -> list[tuple[str, Element, str]]:
 _DASHES = 'stroke-dasharray="6 3"'
 #: Width of a box, gaps between columns and rows, height of a line of text, margin around the text, pixels.
 _WIDTH, _COLUMN_GAP, _ROW_GAP, _LINE, _PAD = 300.0, 56.0, 12.0, 15.0, 11.0
-_CHARACTERS = 44
+#: Slant of a strategy's box, maximum radius of a solution's ends, radius of a context's corners, pixels.
+_SLANT, _END_RADIUS, _CORNER_RADIUS = 14.0, 30.0, 12.0
+#: Left margin of the text, and height of the first line above its lower edge, pixels; maximum characters of a line.
+_TEXT_LEFT, _ASCENT, _CHARACTERS = 20.0, 11.0, 44
 #: Colours of the states, readable on white; the state is also written in each box.
 _COLOURS: Mapping[GoalState, str] = {
     GoalState.SUPPORTED: "#1c7c5c",
@@ -115,7 +127,8 @@ class _Box:
 
     @property
     def bottom(self) -> float:
-        return max(self.top + self.height, *(child.bottom for child in self.children), 0.0)
+        """Lower end of the box and of those below it."""
+        return max([self.top + self.height, *(child.bottom for child in self.children)])
 
     def walk(self) -> Iterator[_Box]:
         yield self
@@ -125,7 +138,7 @@ class _Box:
 
 def draw_argument(root: Element) -> str:
     """Draw the argument as an SVG document."""
-    box = _place(root, 0, _PAD, iter([name for name, _, _ in number_elements(root)]))
+    box = _place(root, 0, _PAD, iter([item.name for item in number_elements(root)]))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD
     height = max(item.top + item.height for item in boxes) + _PAD
@@ -159,12 +172,11 @@ def _place(element: Element, column: int, top: float, names: Iterator[str]) -> _
 
 def _draw_link(parent: _Box, child: _Box) -> str:
     """Draw a link: solid for support, dashed for context, red towards the parent for a challenge."""
-    x, end = parent.left + _WIDTH, child.left
+    start, end, bend = parent.left + _WIDTH, child.left, 0.5 * _COLUMN_GAP
     kind = child.element.kind
     style = 'stroke="#5a6672" marker-end="url(#end)"'
-    path = (
-        f"M{x:g} {parent.middle:g}C{x + 28:g} {parent.middle:g} {end - 28:g} {child.middle:g} {end:g} {child.middle:g}"
-    )
+    controls = f"{start + bend:g} {parent.middle:g} {end - bend:g} {child.middle:g}"
+    path = f"M{start:g} {parent.middle:g}C{controls} {end:g} {child.middle:g}"
     if kind in (ElementKind.CONTEXT, ElementKind.ASSUMPTION):
         style = 'stroke="#5a6672" stroke-dasharray="4 3"'
     elif kind is ElementKind.DEFEATER:
@@ -177,20 +189,21 @@ def _draw_box(box: _Box) -> str:
     x, y, w, h = box.left, box.top, _WIDTH, box.height
     kind, colour = box.element.kind, _COLOURS[box.element.state]
     style = f'fill="#fff" stroke="{colour}" stroke-width="1.6"'
+    right = x + w
+    slanted = f"M{x + _SLANT:g} {y:g}H{right:g}L{right - _SLANT:g} {y + h:g}H{x:g}z"
     shapes = {
-        ElementKind.STRATEGY: f'<path d="M{x + 14:g} {y:g}H{x + w:g}L{x + w - 14:g} {y + h:g}H{x:g}z" {style}/>',
+        ElementKind.STRATEGY: f'<path d="{slanted}" {style}/>',
         ElementKind.DEFEATER: f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" {style} {_DASHES}/>',
     }
     radius = {
-        ElementKind.SOLUTION: 0.5 * min(h, 60.0),
-        ElementKind.CONTEXT: 12.0,
-        ElementKind.ASSUMPTION: 0.5 * min(h, 60.0),
+        ElementKind.SOLUTION: min(0.5 * h, _END_RADIUS),
+        ElementKind.CONTEXT: _CORNER_RADIUS,
+        ElementKind.ASSUMPTION: min(0.5 * h, _END_RADIUS),
     }.get(kind, 0.0)
     rectangle = f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="{radius:g}" {style}/>'
-    left = x + 20.0
     weights = [" font-weight='bold'", *[""] * (len(box.lines) - 1)]
     text = "".join(
-        f'<tspan x="{left:g}" y="{y + _PAD + 11 + _LINE * index:g}"{weight}>{escape(line)}</tspan>'
+        f'<tspan x="{x + _TEXT_LEFT:g}" y="{y + _PAD + _ASCENT + _LINE * index:g}"{weight}>{escape(line)}</tspan>'
         for index, (line, weight) in enumerate(zip(box.lines, weights, strict=True))
     )
     content = f'{shapes.get(kind, rectangle)}<text fill="#10161d">{text}</text>'

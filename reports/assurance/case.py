@@ -6,6 +6,7 @@ Community Standard, version 3; a defeater is a counter-argument of its dialectic
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.claims import Confirmation
-from marsyard.reports.assurance.argument import Element, ElementKind, GoalState, defeater, goal, number_elements
+from marsyard.reports.assurance.argument import (
+    Element,
+    ElementKind,
+    GoalState,
+    NumberedElement,
+    defeater,
+    goal,
+    number_elements,
+)
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.provenance import format_tested_algorithms
 from marsyard.reports.report_file import CampaignReport
@@ -100,25 +109,20 @@ class AssuranceCase:
     factors: tuple[Mapping[str, str], ...] = field(default=())
 
     @property
-    def defeaters(self) -> list[tuple[str, Element, str]]:
-        """Open defeaters with their identifiers, and those of the elements that they challenge."""
-        return [item for item in number_elements(self.root) if item[1].kind is ElementKind.DEFEATER]
+    def defeaters(self) -> list[NumberedElement]:
+        """Open defeaters; their parents are the elements that they challenge."""
+        return [item for item in number_elements(self.root) if item.element.kind is ElementKind.DEFEATER]
 
     def to_json(self) -> dict[str, Any]:
         """Convert to JSON: elements, and links in the words of GSN."""
         listed = number_elements(self.root)
-        links = {
-            ElementKind.CONTEXT: "inContextOf",
-            ElementKind.ASSUMPTION: "inContextOf",
-            ElementKind.DEFEATER: "challenges",
-        }
-        names = {kind: kind.name.lower() for kind in ElementKind}
+        contexts = (ElementKind.CONTEXT, ElementKind.ASSUMPTION)
         return {
             "notation": "GSN Community Standard, version 3",
             "elements": [
                 {
                     "id": name,
-                    "type": names[item.kind],
+                    "type": item.kind.name.lower(),
                     "statement": item.text,
                     "state": item.state.value if item.kind is ElementKind.GOAL else "",
                     "evidence": item.evidence,
@@ -128,7 +132,11 @@ class AssuranceCase:
             "links": [
                 {"source": name, "target": parent, "type": "challenges"}
                 if item.kind is ElementKind.DEFEATER
-                else {"source": parent, "target": name, "type": links.get(item.kind, "supportedBy")}
+                else {
+                    "source": parent,
+                    "target": name,
+                    "type": "inContextOf" if item.kind in contexts else "supportedBy",
+                }
                 for name, item, parent in listed
                 if parent
             ],
@@ -187,7 +195,7 @@ def _argue_run(run: AssuredRun, rows: Sequence[ValidationRow], constants: Iterab
 def _argue_requirement(run: AssuredRun, verdict: Verdict) -> Element:
     """Argue that a requirement is met, with its robustness."""
     required = f"{format_fraction(verdict.probability)} at {format_fraction(verdict.confidence)} confidence"
-    bounds = "" if verdict.lower != verdict.lower else f", bounds {percent(verdict.lower)} to {percent(verdict.upper)}"
+    bounds = "" if math.isnan(verdict.lower) else f", bounds {percent(verdict.lower)} to {percent(verdict.upper)}"
     numbers = f"{verdict.status}: {verdict.failures:,} of {count(verdict.n, 'case')} failed{bounds}. {verdict.note}"
     state = GoalState.SUPPORTED
     if not verdict.status.is_met:
@@ -304,7 +312,8 @@ def _argue_validity(run: AssuredRun, rows: Sequence[ValidationRow], constants: I
 
 def _argue_credibility(factors: Sequence[Mapping[str, str]]) -> Element:
     """Argue that the credibility of the simulation is rated, with the weak factors as defeaters."""
-    weak = [item for item in factors if item["level"][0] in "01"]
+    # a level is a number from 0 to 4, or a range such as "1 to 2"
+    weak = [item for item in factors if item["level"].partition(" ")[0] in ("0", "1")]
     return goal(
         "The credibility of the simulation is rated by the factors of NASA-STD-7009B.",
         Element(ElementKind.SOLUTION, f"{count(len(factors), 'factor')} rated by the developers", evidence=CREDIBILITY),

@@ -1,4 +1,4 @@
-"""Writer of an assurance package: one folder with the assurance case, its evidence, and the hashes of all files.
+"""Assurance package: a folder with the assurance case, its evidence, and the hashes of all files; written and read.
 
 Layout: `index.html`, `case.json`, `case.svg`; `evidence` with the validation rows, the register of fitted constants
 and the credibility factors; `runs/NAME` with the record, rows and report of each campaign, and the record of its
@@ -37,6 +37,7 @@ from marsyard.reports.validation_rows import VALIDATION_FILE
 PAGE, ARGUMENT, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest.json"
 #: Version of the layout of a package.
 SCHEMA = 1
+#: Copy of the record of confirmations in the folder of a campaign.
 CONFIRMATIONS = "confirmations.jsonl"
 _REPORTS_FOLDER = REGISTER_FILE.parent
 _CREDIBILITY_FILE = REGISTER_FILE.with_name("credibility.toml")
@@ -114,7 +115,7 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
         text = (directory / REPORT_JSON).read_text(encoding="utf-8")
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
         data = table(json.loads(text))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{directory} cannot be read: {error}") from error
     report = read_report(text)
     if report is None:

@@ -9,6 +9,7 @@ from marsyard.campaigns.errors import CampaignError
 
 #: Namespace of the signatures: a signature for another purpose is not valid here.
 NAMESPACE = "marsyard-assurance"
+#: Ending of the file of a signature (ssh-keygen(1)), and time limit of one call, s: the user may type a passphrase.
 _ENDING, _TIMEOUT_S = ".sig", 120.0
 
 

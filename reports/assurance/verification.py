@@ -56,7 +56,7 @@ class Verification:
 
 
 def verify_package(folder: Path, signers: Path | None = None) -> Verification:
-    """Verify a package. Raises CampaignError if the folder contains none, or its layout is of another version.
+    """Verify a package. Raises CampaignError if it has no valid manifest, or its layout is of another version.
 
     signers: file of allowed signers; a signature by another key is then a problem
     """
@@ -72,7 +72,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
     with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
         copy = Path(name, "package")
         shutil.copytree(folder, copy, symlinks=True)
-        names = [str(run) for run in manifest.get("runs") or ()]
+        names: Sequence[str] = manifest["runs"]
         if not names:
             problems.append(f"{MANIFEST}: the package contains no campaign")
         for run_name in names:
@@ -86,7 +86,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
                 run = read_run_evidence(copy, f"runs/{run_name}")
                 problems += _verify_run(run, evaluation, record, is_same_program)
                 runs.append(run)
-            except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
+            except (CampaignError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
                 problems.append(f"runs/{run_name}: {_relative(error, copy)}")
         if not is_same_program:
             notes.append(f"claims and page by their hashes only; {_describe_program(manifest)}")
@@ -98,15 +98,24 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
 
 
 def _read_manifest(folder: Path) -> Mapping[str, Any]:
+    """Read the manifest; its key `runs` is a list of names of folders in the folder `runs` of the package."""
     try:
         manifest = table(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
     except OSError as error:
         raise CampaignError(f"{folder} is no assurance package: {MANIFEST} cannot be read") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CampaignError(f"{folder / MANIFEST} is damaged: {error}") from error
     if manifest.get("schema") != SCHEMA:
         raise CampaignError(f"{folder / MANIFEST} has schema {manifest.get('schema')}; allowed: {SCHEMA}")
-    return manifest
+    runs = manifest.get("runs") or []
+    if not isinstance(runs, list) or not all(map(_is_folder_name, runs)):
+        raise CampaignError(f"{folder / MANIFEST} is damaged: runs is not a list of names of folders")
+    return {**manifest, "runs": runs}
+
+
+def _is_folder_name(name: object) -> bool:
+    """Whether a name is that of a folder inside of another one, not a path that leads out of it."""
+    return isinstance(name, str) and name not in ("", "..") and Path(name).name == name
 
 
 def _compare_hashes(folder: Path, stored: Mapping[str, Any]) -> Iterator[str]:
@@ -191,7 +200,7 @@ def _compare_argument(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]
     """Compare the files that are computed from the evidence, and name the first element that differs."""
     try:
         argument = build_argument(runs, folder)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         yield f"evidence: {_relative(error, folder)}"
         return
     for name, content in render_argument(argument).items():

@@ -13,8 +13,6 @@ from marsyard.reports.wording import NOTHING, percent
 
 #: Maximum number of campaigns in a sparkline, and its width and height, pixels.
 _MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
-
-
 #: Maximum number of other campaigns next to a requirement's verdict.
 MAX_OTHER_VERDICTS = 7
 

@@ -107,10 +107,11 @@ def _arrange_pair(products: Products, pair: int) -> dict[str, list[Panel]]:
         panels = [panel for track in tracks for panel in _template_panels(track)]
         rows["templates"] = panels + [Panel() for _ in range(_CELLS - len(panels))]
     delivered = []
-    for index, (prefix, colour) in enumerate((("template", TEMPLATE), ("match", MATCH))):
+    templates, matches = ("template", TEMPLATE, "templates"), ("match", MATCH, "tracked positions")
+    for index, (prefix, colour, name) in enumerate((templates, matches)):
         marks = [mark for track in tracks for mark in _track_marks(track, prefix, colour)]
         marks += _hint_marks(products, pair, index, images[index].shape)
-        content = f": {('templates', 'tracked positions')[index]}" if tracks else ""
+        content = f": {name}" if tracks else ""
         delivered.append(Panel(images[index], f"Image {pair + index + 1}{content}", marks))
     return rows | {"delivered": _spread(delivered)}
 
@@ -161,12 +162,14 @@ def _rectified_panel(
     if lattice is None or frame is None:
         return Panel()
     rectified = _rectify(image, lattice)
-    edge_m = frame[:2] * np.array([1.0, -1.0])
-    pixel_m = frame[2] * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    west_m, north_m, lattice_spacing_m = frame
+    # positions to the right and downwards, as pixels
+    corner_m = np.array([west_m, -north_m])
+    pixel_m = lattice_spacing_m * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
     def ground_square(ground_m: Float[np.ndarray, "2"], side_px: int, style: Mapping[str, Any]) -> list[Mark]:
-        centre = (ground_m * np.array([1.0, -1.0]) - edge_m) / pixel_m
+        centre = (ground_m * np.array([1.0, -1.0]) - corner_m) / pixel_m
         return square(centre, side_px * spacing_m / pixel_m, style)
 
     marks = []
@@ -190,10 +193,12 @@ def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndar
     """Rectify an image by a square lattice of ground points with their pixels (u, v); NaN outside the image."""
     indices = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(indices, indices, indexing="ij")
-    pixels = [ndimage.map_coordinates(lattice[..., component], [v, u], order=1, mode="nearest") for component in (1, 0)]
+    row, column = (
+        ndimage.map_coordinates(lattice[..., component], [v, u], order=1, mode="nearest") for component in (1, 0)
+    )
     rows, columns = image.shape
-    is_inside = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
-    values = ndimage.map_coordinates(image, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
+    is_inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
+    values = ndimage.map_coordinates(image, np.nan_to_num([row, column], nan=-1.0), order=1, mode="nearest")
     return np.asarray(np.where(is_inside, values, np.nan))
 
 

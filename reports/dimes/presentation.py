@@ -100,7 +100,9 @@ def _format_selection(products: Products) -> list[tuple[str, str]]:
     combinations = check_shape(products.get("combinations"), None, 3)
     if combinations is None or not len(combinations):
         return []
-    differences = [f"{number(float(value))} m/s" for value in np.sort(combinations[:, 2])]
+    # columns: templates of the first and of the second pair, and difference
+    _, _, differences_m_s = combinations.T
+    differences = [f"{number(float(value))} m/s" for value in np.sort(differences_m_s)]
     is_selected = check_shape(products.get("selected"), 2) is not None
     other = f"; other combinations: {differences[1]} or more" if len(differences) > 1 else ""
     text = f"{differences[0]} (selected tracks){other}" if is_selected else f"{differences[0]} or more: too large"

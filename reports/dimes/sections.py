@@ -61,6 +61,14 @@ def ignition_section(subject: Subject) -> Section | None:
     )
 
 
+#: Columns of the horizontal speed at touchdown with and without steering.
+SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
+#: Minimum change of speed that counts as an improvement or a degradation, m/s.
+MIN_SPEED_CHANGE_M_S = 1.0
+#: Speeds above which the table gives the fraction of cases, m/s.
+SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
+
+
 def landing_section(subject: Subject) -> Section | None:
     """Create the section on the horizontal speed at touchdown with and without steering by the estimated velocity."""
     landings = landing_rows(subject)
@@ -89,14 +97,6 @@ def landing_section(subject: Subject) -> Section | None:
         ),
         create_speed_block(landings, subject),
     )
-
-
-#: Columns of the horizontal speed at touchdown with and without steering.
-SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
-#: Minimum change of speed that counts as an improvement or a degradation, m/s.
-MIN_SPEED_CHANGE_M_S = 1.0
-#: Speeds above which the table gives the fraction of cases, m/s.
-SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
@@ -135,14 +135,13 @@ def _landing_model(subject: Subject) -> dict[str, str]:
 
 def create_speed_block(landings: pd.DataFrame, subject: Subject) -> Block:
     """Create the table of touchdown speeds with and without steering: mean, quantiles, fractions above speeds."""
-    columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
-    groups = rates.terrain_groups(landings)
-    change = columns[0] - columns[1]
+    corrected, uncorrected = columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
+    groups, change = rates.terrain_groups(landings), corrected - uncorrected
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
     for probability in (0.5, 0.95, 0.99):
         texts = []
         for values in columns:
-            bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
+            _, bound = quantile_bounds(values, probability, CONFIDENCE, groups)
             bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(rates.quantile(values, probability))}{bound_text}")
         name = "median" if probability == 0.5 else f"{format_fraction(probability)} quantile"
@@ -151,13 +150,12 @@ def create_speed_block(landings: pd.DataFrame, subject: Subject) -> Block:
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
     ]
-    improved, degraded, *_ = landing_fractions(landings).values()
     data = {
         "landings": len(landings),
-        "reduced_fraction": improved.fraction,
-        "increased_fraction": degraded.fraction,
-        "mean_with_m_s": float(columns[0].mean()),
-        "mean_without_m_s": float(columns[1].mean()),
+        "reduced_fraction": float(np.mean(change < -MIN_SPEED_CHANGE_M_S)),
+        "increased_fraction": float(np.mean(change > MIN_SPEED_CHANGE_M_S)),
+        "mean_with_m_s": float(corrected.mean()),
+        "mean_without_m_s": float(uncorrected.mean()),
         "largest_gain_m_s": float(-change.min()),
         "largest_loss_m_s": float(change.max()),
     }
@@ -285,9 +283,9 @@ def effect_figure(effects: Sequence[ConditionEffect], unit: str) -> Figure:
     """Draw the effects with their intervals."""
     figure, axes = new_axes(6.4, 0.9 + 0.36 * len(effects))
     y_positions = np.arange(len(effects))
-    values = np.array([effect.effect for effect in effects])
-    axes.hlines(y_positions, values[:, 1], values[:, 2], color=SERIES[0], linewidth=5.0, alpha=0.45)
-    axes.plot(values[:, 0], y_positions, "o", color=SERIES[0])
+    estimates, lower, upper = np.array([effect.effect for effect in effects]).T
+    axes.hlines(y_positions, lower, upper, color=SERIES[0], linewidth=5.0, alpha=0.45)
+    axes.plot(estimates, y_positions, "o", color=SERIES[0])
     axes.axvline(0.0, color=MUTED, linewidth=0.8)
     axes.set_yticks(y_positions, [label(effect.column) for effect in effects])
     axes.set(xlabel=f"change of the mean magnitude ({unit})", ylim=(len(effects) - 0.5, -0.5))

@@ -1,9 +1,10 @@
 """View of a case of a velocity stream: an algorithm that answers after each of any number of images."""
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from marsyard.reports.dimes import case_figures as figures
@@ -17,26 +18,45 @@ from marsyard.reports.wording import note_text, number
 _MAX_PER_ROW = 10
 
 
-def _read_stream(products: Products) -> Float[np.ndarray, "n 6"]:
-    """Read a row for each image: start and end of the time span, estimate, truth (east, north); no row if missing."""
+class _StreamAnswers(NamedTuple):
+    """Answers of a velocity stream, one for each image.
+
+    - spans_s: start and end of the time span that an answer describes
+    - estimated_m_s, true_m_s: velocity (east, north); the estimate is NaN without an answer
+    """
+
+    spans_s: Float[np.ndarray, "n 2"]
+    estimated_m_s: Float[np.ndarray, "n 2"]
+    true_m_s: Float[np.ndarray, "n 2"]
+
+    @property
+    def is_answered(self) -> Bool[np.ndarray, " n"]:
+        """Whether each image has an estimate."""
+        return np.asarray(np.isfinite(self.estimated_m_s[:, 0]))
+
+
+def _read_answers(products: Products) -> _StreamAnswers:
+    """Read the answers of a stream; no answer if they are missing."""
     names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
-    parts = read_arrays(products, dict.fromkeys(names, ("n", 2)))
-    return np.empty((0, 6)) if parts is None else np.concatenate(parts, axis=1)
+    arrays = read_arrays(products, dict.fromkeys(names, ("n", 2)))
+    return _StreamAnswers(*([np.empty((0, 2))] * 3 if arrays is None else arrays))
 
 
 def is_stream_case(products: Products) -> bool:
     """Whether products contain the answers of a velocity stream after each of its images."""
-    images = [to_matrix(products.get(f"image_{index + 1}")) for index in range(len(_read_stream(products)))]
+    n_answers = len(_read_answers(products).spans_s)
+    images = [to_matrix(products.get(f"image_{index + 1}")) for index in range(n_answers)]
     return bool(images) and all(image is not None for image in images)
 
 
 def view_stream(products: Products, _complete: bool = False) -> CaseView:
     """Create the view of a velocity stream: its images, and the estimate after each image."""
+    answers = _read_answers(products)
     rows = []
-    for image_number, row in enumerate(_read_stream(products), start=1):
-        is_answered = bool(np.isfinite(row[2]))
-        values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
-        rows.append(TableRow([str(image_number), *(values if is_answered else ["" for _ in values])], is_answered))
+    for index, is_answered in enumerate(answers.is_answered.tolist()):
+        span_s, estimated, true = (array[index] for array in answers)
+        values = [number(float(value)) for value in (*span_s, *estimated, *true, np.hypot(*(estimated - true)))]
+        rows.append(TableRow([str(index + 1), *(values if is_answered else ["" for _ in values])], is_answered))
     head = ["After image", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
     head += ["True east", "True north", "Error (m/s)"]
     caption = "Images of the stream, and the estimated velocity after each image."
@@ -46,26 +66,27 @@ def view_stream(products: Products, _complete: bool = False) -> CaseView:
 @in_page_style
 def draw_stream_case(products: Products) -> Figure:
     """Draw the images in rows, and both components of the velocity after each image."""
-    table = _read_stream(products)
-    n_rows = -(-len(table) // _MAX_PER_ROW)
+    answers = _read_answers(products)
+    n_images = len(answers.spans_s)
+    n_rows = math.ceil(n_images / _MAX_PER_ROW)
     figure = Figure(figsize=(12.0, 3.4 + 1.6 * n_rows), layout="constrained")
     cells = figure.add_gridspec(2, 1, height_ratios=(1.6 * n_rows, 3.4))
     upper, lower = (figure.add_subfigure(part) for part in (cells[0], cells[1]))
-    names = range(1, len(table) + 1)
+    names = range(1, n_images + 1)
     panels = [Panel(figures.read_square_image(products, f"image_{name}"), str(name)) for name in names]
-    n_columns = min(len(table), _MAX_PER_ROW)
+    n_columns = min(n_images, _MAX_PER_ROW)
     panels += [Panel() for _ in range(n_rows * n_columns - len(panels))]
     fill_panels(upper, [panels[first : first + n_columns] for first in range(0, len(panels), n_columns)])
-    answered_rows = table[np.isfinite(table[:, 2])]
-    start, end = answered_rows[:, 0], answered_rows[:, 1]
+    spans_s, estimated_m_s, true_m_s = (array[answers.is_answered] for array in answers)
+    start, end = spans_s.T
     centres = 0.5 * (start + end)
     for component, (name, axes) in enumerate(zip(("east", "north"), lower.subplots(1, 2), strict=True)):
-        estimates, truth = answered_rows[:, 2 + component], answered_rows[:, 4 + component]
+        estimates, truth = estimated_m_s[:, component], true_m_s[:, component]
         axes.hlines(truth, start, np.maximum(end, start), color=INK, linewidth=1.0)
         axes.plot(centres, truth, color=INK, linewidth=1.0, label="true")
         style: dict[str, Any] = {"fmt": MARKERS[component], "color": SERIES[component], "ecolor": MUTED}
         axes.errorbar(centres, estimates, xerr=0.5 * (end - start), label="answered", **style)
-        if len(answered_rows):
+        if len(spans_s):
             axes.legend()
         axes.set(xlabel="Time tag (s)", ylabel=f"Velocity {name} (m/s)")
     return figure

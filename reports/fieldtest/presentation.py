@@ -5,6 +5,7 @@ The paper is Johnson et al., "Field Testing of the MER DIMES".
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from marsyard.reports.section import Block, Section, Subject, SvgFigure, build_g
 from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 
-#: pd.DataFrame of the paper's Fig. 11 by (category, run).
+#: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
     (group["category"], row["run"]): row
     for group in read_paper(Path(__file__).with_name("paper.toml"))["fig_11"]
@@ -45,19 +46,19 @@ def field_test_section(subject: Subject) -> Section | None:
     grid = build_grid(
         cells,
         {
-            "Category and run": lambda cell: f"{cell['category']}: {cell['run']}",
-            "Triples": lambda cell: f"{cell['valid'].n:,}",
-            "Valid": lambda cell: f"{cell['valid'].hits:,}",
-            "% valid": lambda cell: percent(cell["valid"].fraction),
+            "Category and run": lambda cell: f"{cell.category}: {cell.run}",
+            "Triples": lambda cell: f"{cell.valid.n:,}",
+            "Valid": lambda cell: f"{cell.valid.hits:,}",
+            "% valid": lambda cell: percent(cell.valid.fraction),
             f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.range_text(
-                cell["valid"].lower, cell["valid"].upper
+                cell.valid.lower, cell.valid.upper
             ),
-            "Paper": lambda cell: NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']} %",
-            "Difference": lambda cell: _difference_text(cell["difference_points"]),
+            "Paper": lambda cell: NOTHING if cell.paper_percent is None else f"{cell.paper_percent} %",
+            "Difference": lambda cell: _difference_text(cell.difference_points),
             "Errors above the bound" if bound is None else f"Errors above {bound:g}": lambda cell: (
-                NOTHING if cell["errors_above_bound"] is None else f"{cell['errors_above_bound']:,}"
+                NOTHING if cell.errors_above_bound is None else f"{cell.errors_above_bound:,}"
             ),
-            "Largest error": lambda cell: number(cell["largest"]),
+            "Largest error": lambda cell: number(cell.largest),
         },
     )
     blocks = [Block(grid=grid, note=f"{_field_note(cells)} {fit_note('dimes-fieldtest')}")]
@@ -72,7 +73,27 @@ def field_test_section(subject: Subject) -> Section | None:
     )
 
 
-def field_cells(subject: Subject) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class FieldCell:
+    """Results of a run in a category.
+
+    - valid: fraction of valid triples of images
+    - errors_above_bound: number of errors above the bound of the requirement; None without a bound
+    - largest: largest error; NaN without a valid triple
+    - paper_percent: percentage of valid triples in the paper; None without one
+    - difference_points: difference of the percentage from that of the paper, percentage points; NaN without one
+    """
+
+    category: str
+    run: str
+    valid: rates.CaseFraction
+    errors_above_bound: int | None
+    largest: float
+    paper_percent: int | None
+    difference_points: float
+
+
+def field_cells(subject: Subject) -> list[FieldCell]:
     """List the results of each category and run: first those of the paper, in its order, then others."""
     frame, cells = subject.frame, []
     names = frame[["category", "run"]].dropna().drop_duplicates()
@@ -84,15 +105,15 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
         errors = errors[np.isfinite(errors)]
         fraction, paper_percent = rates.fraction_of(answered, rows), FIG_11.get((category, run), {}).get("percent")
         cells.append(
-            {
-                "category": category,
-                "run": run,
-                "valid": fraction,
-                "errors_above_bound": None if subject.bound is None else int((errors > subject.bound).sum()),
-                "largest": float(errors.max()) if errors.size else math.nan,
-                "paper_percent": paper_percent,
-                "difference_points": math.nan if paper_percent is None else 100.0 * fraction.fraction - paper_percent,
-            }
+            FieldCell(
+                category=category,
+                run=run,
+                valid=fraction,
+                errors_above_bound=None if subject.bound is None else int((errors > subject.bound).sum()),
+                largest=float(errors.max()) if errors.size else math.nan,
+                paper_percent=paper_percent,
+                difference_points=math.nan if paper_percent is None else 100.0 * fraction.fraction - paper_percent,
+            )
         )
     return cells
 
@@ -102,10 +123,10 @@ def _difference_text(points: float) -> str:
     return NOTHING if math.isnan(points) else f"{points:+.1f} pp{mark}".replace("-", "−")
 
 
-def _field_note(cells: Sequence[Mapping[str, Any]]) -> str:
+def _field_note(cells: Sequence[FieldCell]) -> str:
     """Describe definitions, the paper's misprints, and cells that differ from the paper."""
     definitions = note_text("dimes.field_test")
-    if not any(cell["paper_percent"] is not None for cell in cells):
+    if not any(cell.paper_percent is not None for cell in cells):
         return definitions
     inconsistent_rows = [
         f"{run}, {category} ({row['valid']} + {row['invalid']} ≠ {row['total']})"
@@ -114,8 +135,8 @@ def _field_note(cells: Sequence[Mapping[str, Any]]) -> str:
     ]
     totals = sum(row["total"] for row in FIG_11.values())
     counts = sum(row["valid"] + row["invalid"] for row in FIG_11.values())
-    large = [cell for cell in cells if abs(cell["difference_points"]) > LARGE_DIFFERENCE_POINTS]
-    names = "; ".join(f"{cell['category']}, {cell['run']}" for cell in large) or "none"
+    large = [cell for cell in cells if abs(cell.difference_points) > LARGE_DIFFERENCE_POINTS]
+    names = "; ".join(f"{cell.category}, {cell.run}" for cell in large) or "none"
     return (
         f"{definitions} The paper's table has misprints in the rows {'; '.join(inconsistent_rows)}. Its totals sum to "
         f"{totals:,}, its counts to {counts:,}. This report uses the totals. For Pisgah Run 3, same direction, the "

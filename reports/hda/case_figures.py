@@ -8,7 +8,7 @@ products raise ValueError.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -156,15 +156,19 @@ def draw_maps(products: Products) -> Figure:
     max_deviation_m = float(np.nanquantile(np.abs(maps.elevation_m - median), 0.99)) or 1.0
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
     coverage = np.where(truth.covered, 1.0, np.nan)
-    maps_by_name = (
-        ("elevation (m)", maps.elevation_m - median, truth.elevation_m - median, None),
-        ("roughness (m)", maps.roughness_m, truth.roughness_m * coverage, maps.max_roughness_m),
-        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * coverage, float(np.degrees(maps.max_slope_rad))),
-    )
-    for upper, lower, (name, map_values, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
+    true_degrees = np.degrees(truth.slope_rad) * coverage
+    estimated_and_true = {
+        "elevation (m)": (maps.elevation_m - median, truth.elevation_m - median),
+        "roughness (m)": (maps.roughness_m, truth.roughness_m * coverage),
+        "slope (deg)": (degrees, true_degrees),
+    }
+    limits = {"roughness (m)": maps.max_roughness_m, "slope (deg)": float(np.degrees(maps.max_slope_rad))}
+    # the last column is the safe landing map
+    for upper, lower, name in zip(map_row, truth_row, estimated_and_true, strict=False):
+        map_values, true_values = estimated_and_true[name]
         colour_scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}
-        if limit is not None:
-            colour_scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
+        if name in limits:
+            colour_scale = {"vmin": 0.0, "vmax": 2.0 * limits[name], "cmap": HAZARD_COLOURS}
         image = upper.imshow(map_values, interpolation="nearest", **colour_scale)
         lower.pcolormesh(cells[..., 1], cells[..., 0], true_values, shading="nearest", rasterized=True, **colour_scale)
         colour_bar = figure.colorbar(
@@ -270,6 +274,20 @@ def _require(product: Product | None, name: str) -> Product:
     return product
 
 
+class _DrawnCamera(NamedTuple):
+    """A camera of the figure of the motion: its pose relative to the first camera, and its rays as `EstimatedMotion`.
+
+    line: style of the outline; a camera with a dotted outline has no rays and axes in the figure
+    """
+
+    name: str
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    corner_rays: Float[np.ndarray, "4 3"]
+    colour: str
+    line: str = "-"
+
+
 def _draw_motion_view(
     axes: Axes, motion: EstimatedMotion, upright_from_camera: Float[np.ndarray, "3 3"], axis_pair: list[int]
 ) -> None:
@@ -280,21 +298,21 @@ def _draw_motion_view(
         return np.asarray((points @ upright_from_camera.T)[..., axis_pair])
 
     axes.plot(*project(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
-    poses = (
-        (np.eye(3), np.zeros(3), "#ff4b3e", "-", "first camera"),
-        (motion.rotation, motion.translation, "#35d46b", "-", "second camera"),
-        (motion.true_rotation, motion.true_translation, WHITE, ":", "second camera, true"),
-    )
-    for number, (rotation, translation, colour, line, name) in enumerate(poses):
-        centre = -rotation.T @ translation
-        rays = motion.corner_rays[min(number, 1)] * depth
-        footprint = centre + rays @ rotation
-        axes.plot(*project(footprint[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
-        if line == "-":
+    first_rays, second_rays = motion.corner_rays
+    for camera in (
+        _DrawnCamera("first camera", np.eye(3), np.zeros(3), first_rays, "#ff4b3e"),
+        _DrawnCamera("second camera", motion.rotation, motion.translation, second_rays, "#35d46b"),
+        _DrawnCamera("second camera, true", motion.true_rotation, motion.true_translation, second_rays, WHITE, ":"),
+    ):
+        centre, colour = -camera.rotation.T @ camera.translation, camera.colour
+        footprint = centre + camera.corner_rays * depth @ camera.rotation
+        closed_outline = project(np.vstack([footprint, footprint[:1]]))
+        axes.plot(*closed_outline.T, color=colour, linestyle=camera.line, linewidth=1.1, label=camera.name)
+        if camera.line == "-":
             for corner in footprint:
                 axes.plot(*project(np.array([centre, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
             # axes of the camera, with 12 % of the depth as length
-            for axis_vector in 0.12 * depth * rotation:
+            for axis_vector in 0.12 * depth * camera.rotation:
                 axes.plot(*project(np.array([centre, centre + axis_vector])).T, color=colour, linewidth=1.8)
     axes.set_facecolor(_BACKGROUND)
     axes.grid(visible=False)

@@ -1,41 +1,34 @@
-"""Sections that compare landings with the paper: touchdown errors (Table II), run times (Table I), tracking limits.
+"""Sections that compare landings with the paper: touchdown errors (Table II) and run times (Table I).
 
 The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from marsyard.reports import populations, rates, section
+from marsyard.reports import populations, rates
 from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figure_style import MUTED, REQUIREMENT, in_page_style
 from marsyard.reports.fits import fit_note
 from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, PAPER, landing_rows
 from marsyard.reports.hda.sites_section import MIN_CURVE_VALUES
-from marsyard.reports.plots import RateLine, cumulative_figure, draw_rates
-from marsyard.reports.populations import flag_mask
-from marsyard.reports.rates import CONFIDENCE, PooledRate, pooled_rate, rate_text
+from marsyard.reports.plots import cumulative_figure
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
     Block,
     Grid,
     Section,
     Subject,
-    build_grid,
     create_section,
     drop_empty_columns,
     has_values,
     svg_figure,
 )
 from marsyard.reports.statistics.samples import mean_interval
-from marsyard.reports.wording import NOTHING, count, format_fraction, interval, note_text, number, percent
+from marsyard.reports.wording import NOTHING, count, format_fraction, interval, note_text, number
 
 #: Three measures of the distance from touchdown to site.
 TOUCHDOWN_ERRORS = (
@@ -135,10 +128,12 @@ def run_times_section(subject: Subject) -> Section | None:
     durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
     is_complete = np.isfinite(durations).all(axis=1)
     durations, rows_with_times, cases = durations[is_complete], frame[is_complete], int(is_complete.sum())
-    if not cases or not durations.sum() > 0.0:
+    if not cases:
         return None
     medians_s, percentiles_95_s = np.median(durations, axis=0), [rates.quantile(column, 0.95) for column in durations.T]
     paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(medians_s.sum())
+    if total_s <= 0.0:
+        return None
     # the factor scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
     for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s, strict=True):
@@ -147,9 +142,9 @@ def run_times_section(subject: Subject) -> Section | None:
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         seconds = {"paper_s": stage["seconds"], "median_s": median_s, "p95_s": p95_s, "scaled_s": factor * median_s}
         data.append({"name": stage["name"], **seconds, "parameters": text})
-        fractions = [f"{100.0 * stage['seconds'] / paper_total_s:.0f} %", f"{100.0 * median_s / total_s:.0f} %"]
-        times = [f"{stage['seconds']:.2f}", fractions[0], _milliseconds(median_s), fractions[1], _milliseconds(p95_s)]
-        rows.append([stage["name"], *times, stage["parameters"], text])
+        paper_times = [f"{stage['seconds']:.2f}", f"{100.0 * stage['seconds'] / paper_total_s:.0f} %"]
+        times = [_milliseconds(median_s), f"{100.0 * median_s / total_s:.0f} %", _milliseconds(p95_s)]
+        rows.append([stage["name"], *paper_times, *times, stage["parameters"], text])
     totals = [f"{paper_total_s:.2f}", "100 %", _milliseconds(total_s), "100 %", NOTHING]
     rows.append(["Total", *totals, NOTHING, NOTHING])
     times_head = ["Paper (s)", "Fraction of total", "Median here (ms)", "Fraction of total", "95 % quantile here (ms)"]
@@ -163,161 +158,3 @@ def run_times_section(subject: Subject) -> Section | None:
 
 def _milliseconds(seconds: float) -> str:
     return NOTHING if math.isnan(seconds) else f"{1e3 * seconds:,.1f}"
-
-
-#: Minimum fraction of tracked features for good tracking.
-GOOD_FRACTION = 0.9
-#: Minimum change divided by the paper's limit; smaller changes are treated as zero.
-_MIN_RELATIVE_CHANGE = 0.02
-#: Minimum number of distinct sizes of a change for a curve.
-_MIN_SIZES = 3
-
-
-@dataclass(frozen=True)
-class SizeResult:
-    """Correctly tracked features of the flights with one change between the images.
-
-    - size: signed size of the change, in its unit
-    - flights, good: number of flights, and of flights with at least `GOOD_FRACTION` of their features tracked
-    """
-
-    size: float
-    tracked: PooledRate
-    flights: int
-    good: int
-
-
-@dataclass(frozen=True)
-class TrackingCurve:
-    """Tracked fraction against the size of one change between the images, which is an entry of `paper.toml`.
-
-    - points: results by size, including zero change
-    - knee_up, knee_down: sizes of positive and negative change at which the tracked fraction falls below
-      `GOOD_FRACTION`, see `find_knee`
-    """
-
-    change: Mapping[str, Any]
-    points: Sequence[SizeResult]
-    knee_up: float
-    knee_down: float
-
-    def knee_text(self, value: float, sign: float) -> str:
-        """Format a knee with its unit; `sign` is that of its changes."""
-        if math.isnan(value):
-            return NOTHING
-        if math.isinf(value):
-            return f"> {max(sign * point.size for point in self.points):g} {self.change['unit']}"
-        return f"{value:.1f} {self.change['unit']}"
-
-    @property
-    def min_fraction_within_limit(self) -> float:
-        """Minimum fraction of tracked features over all sizes up to the paper's limit."""
-        # the tolerance of 0.1 % allows for rounding of the sizes
-        fractions = [point.tracked.fraction for point in self.points if abs(point.size) <= 1.001 * self.change["paper"]]
-        return float(np.nanmin(fractions)) if fractions and not np.all(np.isnan(fractions)) else math.nan
-
-
-def limits_section(subject: Subject) -> Section | None:
-    """Create the section on tracked features by change; None unless each flight changes at most one condition."""
-    frame = landing_rows(subject)
-    curves = [] if frame is None else tracking_curves(frame)
-    if not curves:
-        return None
-    knee_grid = build_grid(
-        curves,
-        {
-            "Change": lambda curve: curve.change["name"],
-            "Paper's limit": lambda curve: f"{curve.change['paper']:g} {curve.change['unit']}",
-            "Knee": lambda curve: curve.knee_text(curve.knee_up, 1.0),
-            "Knee, negative change": lambda curve: curve.knee_text(curve.knee_down, -1.0),
-            "Minimum fraction within the paper's limit": lambda curve: percent(curve.min_fraction_within_limit),
-        },
-    )
-    size_grid = build_grid(
-        [(curve.change, point) for curve in curves for point in curve.points],
-        {
-            "Change": lambda pair: pair[0]["name"],
-            "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
-            "Flights": lambda pair: f"{pair[1].flights:,}",
-            "Correctly tracked": lambda pair: rate_text(pair[1].tracked),
-            "Flights with at least 90 %": lambda pair: f"{pair[1].good:,}",
-        },
-    )
-    caption = f"Bars are {format_fraction(CONFIDENCE)} intervals. Dashed: limit of the paper. Dotted: 90 %."
-    figure = section.svg_figure(limits_figure(curves), "limits", caption, wide=True)
-    blocks = [
-        Block(text=note_text("hda.limits_text"), figures=[figure]),
-        Block(heading="Knees", grid=drop_empty_columns(knee_grid), note=note_text("hda.limits")),
-        Block(heading="By size", grid=size_grid),
-    ]
-    return Section("limits", "Limits", "Tracking by change between the images", blocks, {"curves": curves})
-
-
-def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
-    """Create a curve for each change with at least three sizes; empty if flights combine several changes."""
-    changes = PAPER["changes"]
-    if "tracks_correct" not in frame:
-        return []
-    sizes = [change["scale"] * numbers(frame, change["column"]) for change in changes]
-    min_sizes = [_MIN_RELATIVE_CHANGE * change["paper"] for change in changes]
-    is_changed = np.stack([np.abs(size) > min_size for size, min_size in zip(sizes, min_sizes, strict=True)])
-    is_complete = np.isfinite(np.stack(sizes)).all(axis=0)
-    if not is_complete.any() or np.any(is_changed[:, is_complete].sum(axis=0) > 1):
-        return []
-    is_unchanged = is_complete & ~is_changed.any(axis=0)
-    result = []
-    for change, size, has_change in zip(changes, sizes, is_changed, strict=True):
-        is_selected = is_complete & (has_change | is_unchanged)
-        rounded = np.where(has_change, np.round(size, 1), 0.0)
-        if np.unique(rounded[is_selected]).size >= _MIN_SIZES:
-            points = []
-            for value in np.unique(rounded[is_selected]):
-                flights = frame[is_selected & (rounded == value)]
-                # a flight without tracks counts as zero of its visible features
-                tracked_rate = pooled_rate(flights, "tracks_correct", "features_in_view")
-                points.append(
-                    SizeResult(float(value), tracked_rate, len(flights), int(flag_mask(flights, "tracked_well").sum()))
-                )
-            result.append(TrackingCurve(change, points, find_knee(points, 1.0), find_knee(points, -1.0)))
-    return result
-
-
-def find_knee(results: Sequence[SizeResult], sign: float) -> float:
-    """Find the size of change at which the interpolated fraction falls below `GOOD_FRACTION`.
-
-    `sign` selects positive (1) or negative (-1) changes. Infinite if all fractions are larger; NaN with fewer than two
-    sizes in this direction.
-    """
-    points_by_change = sorted(
-        (sign * point.size, point.tracked.fraction) for point in results if sign * point.size >= 0.0
-    )
-    points_by_change = [point for point in points_by_change if not math.isnan(point[1])]
-    if len(points_by_change) < 2:
-        return math.nan
-    if points_by_change[0][1] < GOOD_FRACTION:
-        return points_by_change[0][0]
-    for (size, fraction), (next_size, next_fraction) in pairwise(points_by_change):
-        if next_fraction < GOOD_FRACTION:
-            return size + (next_size - size) * (fraction - GOOD_FRACTION) / (fraction - next_fraction)
-    return math.inf
-
-
-@in_page_style
-def limits_figure(results: Sequence[TrackingCurve]) -> Figure:
-    """Draw the curves with the paper's limits."""
-    figure = Figure(figsize=(9.0, 2.7 if len(results) < 3 else 5.2), layout="constrained")
-    columns = min(2, len(results))
-    panels = figure.subplots(-(-len(results) // columns), columns, squeeze=False, sharey=True)
-    for axes, curve in zip(panels.ravel(), results, strict=False):
-        x = [point.size for point in curve.points]
-        draw_rates(axes, [RateLine("", x, [point.tracked for point in curve.points])])
-        for limit in (-curve.change["paper"], curve.change["paper"]):
-            if min(x) <= limit <= max(x):
-                axes.axvline(limit, color=REQUIREMENT, linestyle="--", linewidth=1.2)
-        axes.axhline(GOOD_FRACTION, color=MUTED, linewidth=0.9, linestyle=":")
-        axes.set(title=curve.change["name"], xlabel=f"change ({curve.change['unit']})")
-    for axes in panels.ravel()[len(results) :]:
-        axes.set_axis_off()
-    for axes in panels[:, 0]:
-        axes.set_ylabel("features correctly tracked")
-    return figure

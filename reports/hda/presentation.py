@@ -12,7 +12,8 @@ import numpy as np
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
-from marsyard.reports.hda.paper_sections import limits_section, run_times_section, touchdown_section
+from marsyard.reports.hda.limits_section import limits_section
+from marsyard.reports.hda.paper_sections import run_times_section, touchdown_section
 from marsyard.reports.hda.products import (
     is_hda_case,
     read_images,
@@ -105,11 +106,12 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
         slope_deg, roughness_m = (to_float(row.get(f"{place}_{name}")) for name in ("slope_deg", "roughness_m"))
         if math.isnan(slope_deg + roughness_m):
             return None
-        ratios = slope_deg / to_float(row.get("max_slope_deg")), roughness_m / to_float(row.get("max_roughness_m"))
+        slope_ratio = slope_deg / to_float(row.get("max_slope_deg"))
+        roughness_ratio = roughness_m / to_float(row.get("max_roughness_m"))
         detail = f"ground with a slope of {number(slope_deg)} deg and a roughness of {number(roughness_m)} m"
         if place == "touchdown" and not math.isnan(distance_m := to_float(row.get("touchdown_error_m"))):
             detail += f", {number(distance_m)} m from the site"
-        return Cause("slope" if ratios[0] > ratios[1] else "roughness", detail)
+        return Cause("slope" if slope_ratio > roughness_ratio else "roughness", detail)
     if metric in ("converged", "site_reported") and not is_true(row.get("converged")):
         return Cause(
             "few tracks", f"{to_float(row.get('tracks')):.0f} of {to_float(row.get('features')):.0f} features tracked"

@@ -127,11 +127,11 @@ def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
     points = check_shape(products.get("sparse_points"), None, 3)
     if arrays is None or points is None or not len(points):
         return None
-    rotation, translation, true_rotation, true_translation, *corner_rays = arrays
+    rotation, translation, true_rotation, true_translation, first_rays, second_rays = arrays
     return EstimatedMotion(
         rotation=rotation,
         translation=translation,
-        corner_rays=(corner_rays[0], corner_rays[1]),
+        corner_rays=(first_rays, second_rays),
         true_rotation=true_rotation,
         true_translation=true_translation,
         points=points,

@@ -6,10 +6,11 @@ Figures and "the paper" refer to Johnson, Montgomery & Matthies, "Vision Guided 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from marsyard.reports import populations, rates, section
@@ -36,16 +37,22 @@ from marsyard.scenarios.landing.map_score import CLASS_BOUNDS, CLASS_NAMES
 
 #: Minimum number of values for a cumulative curve.
 MIN_CURVE_VALUES = 5
-
-
-#: Classes of the true ground that both images show, best first. All positions within one lander radius of a wide safe
-#: site are also safe.
-GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
-#: Names of the outcomes of `classify_answers`, in the same order; "crashed" means every case that did not finish.
-ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "crashed")
-_GROUND_TEXTS = dict(
-    zip(GROUNDS, ("a wide safe site exists", "only narrow safe sites exist", "no safe site exists"), strict=True)
-)
+#: Classes of the true ground that both images show, best first, with their texts in the table. All positions within one
+#: lander radius of a wide safe site are also safe.
+GROUNDS = {
+    "wide safe site": "a wide safe site exists",
+    "narrow safe site": "only narrow safe sites exist",
+    "no safe site": "no safe site exists",
+}
+#: Names of the outcomes of `classify_answers`, in the same order, with their headings; "crashed" means every case that
+#: did not finish.
+ANSWERS = {
+    "truly safe site": "safe site reported",
+    "unsafe site": "unsafe site reported",
+    "'no safe site'": "'no safe site'",
+    "not converged": "not converged",
+    "crashed": "crashed",
+}
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
@@ -86,20 +93,26 @@ def create_outcome_block(frame: pd.DataFrame) -> Block:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [
-        [_GROUND_TEXTS[ground], *(f"{answer_counts[name]:,}" for name in ANSWERS)]
-        for ground, answer_counts in counts.items()
+        [GROUNDS[ground], *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()
     ]
-    head = ["Ground truth", "safe site reported", "unsafe site reported", *ANSWERS[2:]]
+    head = ["Ground truth", *ANSWERS.values()]
     note = note_text("hda.outcomes")
     grid, data = Grid(head, rows), {"outcomes": counts}
     return Block(heading="Answers by ground truth", grid=grid, note=note, data=data)
 
 
-def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
-    """Collect the distances of reported sites and of true touchdowns to the nearest unsafe grid position, metres.
+class HazardDistances(NamedTuple):
+    """Distances to the nearest unsafe position of the grid, and the terrain of each flight (None if unknown).
 
-    The distance of an unsafe position is 0. It is infinite if the grid has no unsafe position.
+    distances_m: 0 on unsafe ground; infinite if the grid has no unsafe position
     """
+
+    distances_m: Float[np.ndarray, " n"]
+    terrains: Int[np.ndarray, " n"] | None
+
+
+def hazard_distances(frame: pd.DataFrame) -> dict[str, HazardDistances]:
+    """Collect the distances of reported sites and of true touchdowns to the nearest hazard."""
     rows_with_site = frame[populations.flag_mask(frame, "site_reported")]
     distances = {}
     for name, rows, prefix in (("reported site", rows_with_site, "site"), ("true touchdown", frame, "touchdown")):
@@ -107,16 +120,17 @@ def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
         if f"{prefix}_safe" in rows:
             is_unsafe = rows[f"{prefix}_safe"].eq(False).fillna(False).to_numpy(dtype=np.bool_)
             values = np.where(is_unsafe & ~np.isnan(values), 0.0, values)
-        distances[name] = values[~np.isnan(values)]
+        is_known = ~np.isnan(values)
+        distances[name] = HazardDistances(values[is_known], rates.terrain_groups(rows[is_known]))
     return distances
 
 
-def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
+def distance_grid(distances: Mapping[str, HazardDistances]) -> Grid:
     """Create a table of minimum distance, median, 5 % quantile, and lower bound of the 5 % quantile."""
     rows = []
-    for name, values in curves.items():
+    for name, (values, terrains) in distances.items():
         if values.size:
-            bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
+            bound, _ = quantile_bounds(values, 0.05, CONFIDENCE, terrains)
             # the method does not interpolate, since values can be infinite
             low, median = (float(np.quantile(values, probability, method="lower")) for probability in (0.05, 0.5))
             texts = [_distance_text(float(values.min()))]
@@ -139,12 +153,13 @@ def create_distance_block(frame: pd.DataFrame) -> Block | None:
     grid = drop_empty_columns(distance_grid(distances))
     if not grid.rows:
         return None
-    all_values = np.concatenate([*distances.values()])
+    curves = {name: values for name, (values, _) in distances.items()}
+    all_values = np.concatenate([*curves.values()])
     edge_m = float(np.max(all_values[np.isfinite(all_values)], initial=0.0))
     figures = []
-    if edge_m > 0.0 and max(values.size for values in distances.values()) >= MIN_CURVE_VALUES:
+    if edge_m > 0.0 and max(values.size for values in curves.values()) >= MIN_CURVE_VALUES:
         # infinite distances lie beyond the axis
-        curves = {name: np.where(np.isinf(values), 2.0 * edge_m, values) for name, values in distances.items()}
+        curves = {name: np.where(np.isinf(values), 2.0 * edge_m, values) for name, values in curves.items()}
         labels = ("distance to the nearest unsafe position (m)", "fraction above this distance")
         figure = cumulative_figure(curves, labels, complementary=True)
         figure.axes[0].set_xlim(0.0, 1.02 * edge_m)
@@ -218,7 +233,7 @@ def create_class_blocks(frame: pd.DataFrame) -> list[Block]:
         return []
     n_safe_rightly = numbers(frame, "footprints_called_safe") - numbers(frame, "footprints_called_safe_unsafe")
     rate_rows = frame.assign(footprints_called_safe_rightly=n_safe_rightly)
-    rates = {name: pooled_rate(rate_rows, *columns) for name, columns in RATES.items()}
+    footprint_rates = {name: pooled_rate(rate_rows, *columns) for name, columns in RATES.items()}
     hazards = [item for item in classes if item.is_hazard and item.called_safe.total]
     class_grid = build_grid(
         hazards,
@@ -233,7 +248,9 @@ def create_class_blocks(frame: pd.DataFrame) -> list[Block]:
         },
     )
     rows = [
-        [name, f"{item.hits:,} of {item.total:,}", rate_text(item)] for name, item in rates.items() if item.total > 0
+        [name, f"{item.hits:,} of {item.total:,}", rate_text(item)]
+        for name, item in footprint_rates.items()
+        if item.total > 0
     ]
     rate_grid = Grid(["", "Footprints", f"Fraction ({format_fraction(CONFIDENCE)} interval)"], rows)
     figures = []
@@ -241,23 +258,21 @@ def create_class_blocks(frame: pd.DataFrame) -> list[Block]:
         caption = "Bars are the intervals of the table. There is no bar if the rate is 0."
         figures.append(section.svg_figure(class_figure(hazards), "classes", caption))
     blocks = [Block(heading="Missed hazards by size", figures=figures, grid=class_grid)] if hazards else []
-    data = {"rates": rates, "classes": classes}
-    heading, note = (
-        "Safe footprints and large hazards",
-        f"{note_text('hda.classes')} {note_text('hda.footprint_rates', confidence=format_fraction(CONFIDENCE))}",
-    )
-    return [*blocks, Block(heading=heading, grid=rate_grid, note=note, data=data)]
+    data = {"rates": footprint_rates, "classes": classes}
+    note = f"{note_text('hda.classes')} {note_text('hda.footprint_rates', confidence=format_fraction(CONFIDENCE))}"
+    return [*blocks, Block(heading="Safe footprints and large hazards", grid=rate_grid, note=note, data=data)]
 
 
 @in_page_style
 def class_figure(classes: Sequence[HazardClass]) -> Figure:
     """Draw the fractions of missed hazards against their size, by roughness and by slope."""
     figure = Figure(figsize=(7.2, 3.3), layout="constrained")
-    rates = [rate for item in classes for rate in (item.called_safe, item.unflagged)]
-    top = float(np.nanmax([(rate.fraction, rate.upper) for rate in rates], initial=0.0)) or 1.0
+    drawn_rates = [rate for item in classes for rate in (item.called_safe, item.unflagged)]
+    top = float(np.nanmax([(rate.fraction, rate.upper) for rate in drawn_rates], initial=0.0)) or 1.0
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         kind_classes = [item for item in classes if item.kind == kind]
         positions = np.arange(len(kind_classes))
+        # the two marks of a class are next to each other
         called_safe = RateLine(
             "classified as safe", (positions - 0.08).tolist(), [item.called_safe for item in kind_classes]
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,11 +30,8 @@ from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import Section, Subject, create_section, has_values
 from marsyard.reports.wording import number
 
-#: Required position error: the bound of a false fix.
-_MAX_POSITION_ERROR_M = 40.0
-_FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
-#: Error of the published coarse stage, m.
-_MAX_COARSE_ERROR_M = 200.0
+#: Maximum position error of a correct fix, and error of the published coarse stage, metres.
+_MAX_POSITION_ERROR_M, _MAX_COARSE_ERROR_M = 40.0, 200.0
 
 
 def _compute_coarse_rate(frame: pd.DataFrame) -> CaseFraction:
@@ -44,8 +41,11 @@ def _compute_coarse_rate(frame: pd.DataFrame) -> CaseFraction:
     return fraction_of(numbers(rows, "coarse_error_m") <= _MAX_COARSE_ERROR_M, rows)
 
 
-_COARSE = Rate("coarse", "Coarse position within 200 m", _compute_coarse_rate)
-_FALSE_FIX = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
+_COARSE = Rate("coarse", f"Coarse position within {_MAX_COARSE_ERROR_M:g} m", _compute_coarse_rate)
+_FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+_FALSE_FIX = Rate(
+    "false_fix", f"A reported position is wrong by more than {_MAX_POSITION_ERROR_M:g} m", flag_rate("false_fix")
+)
 _QUANTITIES = (
     Quantity("coarse_error_m", "horizontal error of the coarse position (m)"),
     Quantity("position_error_at_10_s_m", "horizontal position error after 10 s (m)"),
@@ -91,7 +91,7 @@ def position_section(subject: Subject) -> Section | None:
     )
 
 
-def conditions_section(subject: Subject) -> Section | None:
+def light_section(subject: Subject) -> Section | None:
     """Create the section on light and texture; None for cases of another system."""
     frame = subject.frame
     if not has_values(frame, "sun_difference_deg", "fixed_in_time"):
@@ -119,9 +119,20 @@ def conditions_section(subject: Subject) -> Section | None:
     return create_section("localisation-conditions", "Light", "Light and texture", *blocks, causes)
 
 
-_AXES = ("east", "north", "up")
-#: Enlargement of the landmarks' residuals.
+#: Enlargement of the landmarks' residuals in the figure.
 _RESIDUAL_SCALE = 20.0
+
+
+class Track(NamedTuple):
+    """Estimates after each image and at the end of a case; NaN for a refusal.
+
+    - times_s: times after the start
+    - errors_m, deviations_m: position errors (east, north, up), and the standard deviations that the algorithm reports
+    """
+
+    times_s: Float[np.ndarray, " n"]
+    errors_m: Float[np.ndarray, "n 3"]
+    deviations_m: Float[np.ndarray, "n 3"]
 
 
 def is_localisation_case(products: Products) -> bool:
@@ -136,22 +147,23 @@ def is_localisation_case(products: Products) -> bool:
     return len(arrays[0]) == len(names) and set(names) <= set(PositionOutcome.__members__)
 
 
-def read_track(products: Products) -> Float[np.ndarray, "n 7"]:
-    """Read the track: time, errors east, north, up, and their standard deviations; NaN for a refusal."""
-    return np.asarray(products["track"], dtype=np.float64)
+def read_track(products: Products) -> Track:
+    """Read the track of a localisation case."""
+    times_s, errors_m, deviations_m = np.split(np.asarray(products["track"], dtype=np.float64), (1, 4), axis=1)
+    return Track(times_s[:, 0], errors_m, deviations_m)
 
 
 @in_page_style
 def draw_errors(products: Products) -> Figure:
     """Draw the position error of each component over time, with bands of three standard deviations."""
     track = read_track(products)
-    valid = track[np.isfinite(track[:, 0])]
+    times_s, errors_m, deviations_m = (values[np.isfinite(track.times_s)] for values in track)
     figure = Figure(figsize=(12.0, 3.2), layout="constrained")
-    for component, (name, axes) in enumerate(zip(_AXES, figure.subplots(1, 3), strict=True)):
-        band = 3.0 * valid[:, 4 + component]
-        axes.fill_between(valid[:, 0], -band, band, color=MUTED, alpha=0.25, linewidth=0.0)
+    for component, (name, axes) in enumerate(zip(("east", "north", "up"), figure.subplots(1, 3), strict=True)):
+        band = 3.0 * deviations_m[:, component]
+        axes.fill_between(times_s, -band, band, color=MUTED, alpha=0.25, linewidth=0.0)
         axes.axhline(0.0, color=INK, linewidth=0.8)
-        axes.plot(valid[:, 0], valid[:, 1 + component], marker="o", color=SERIES[component])
+        axes.plot(times_s, errors_m[:, component], marker="o", color=SERIES[component])
         axes.set(xlabel="Time after the start (s)", ylabel=f"Position error {name} (m)")
     return figure
 
@@ -206,13 +218,15 @@ def view(products: Products, _complete: bool = False) -> CaseView:
         drawn.append(CaseFigure("landmarks", landmarks, caption, wide=False))
     rows = []
     track, outcomes, inliers = read_track(products), products["outcomes"], products["inliers"]
-    for index, (values, outcome) in enumerate(zip(track, outcomes, strict=True)):
-        is_valid = bool(np.isfinite(values[0]))
-        name = f"image {index + 1}" if index < len(track) - 1 else "end"
+    for index, outcome in enumerate(outcomes):
+        is_valid = bool(np.isfinite(track.times_s[index]))
+        name = f"image {index + 1}" if index < len(outcomes) - 1 else "end"
         used = "" if not np.isfinite(inliers[index]) else f"{inliers[index]:.0f}"
         text = PositionOutcome[str(outcome)].value
-        errors = [number(float(value)) if is_valid else "" for value in (*values[1:4], np.hypot(*values[4:6]))]
-        rows.append(TableRow([name, text, used, *errors], is_valid))
+        deviation_east_m, deviation_north_m, _ = track.deviations_m[index]
+        lengths = (*track.errors_m[index], np.hypot(deviation_east_m, deviation_north_m))
+        texts = [number(float(length)) if is_valid else "" for length in lengths]
+        rows.append(TableRow([name, text, used, *texts], is_valid))
     head = ["Estimate", "Outcome", "Landmarks used", "Error east (m)", "north (m)", "up (m)", "Reported sd (m)"]
     return CaseView(drawn, head=head, rows=rows)
 
@@ -222,11 +236,12 @@ _MIN_INLIERS = 15
 
 
 def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
-    """Return whether a wrong or missing position has few landmarks, with the difference of the suns."""
+    """Return the cause of a wrong or missing position: few or biased landmarks, with the difference of the suns."""
     if "position_error" not in metric and metric != "fixed_in_time":
         return None
     inliers, suns_deg = to_float(row.get("inliers_median")), to_float(row.get("sun_difference_deg"))
-    name = "few landmarks" if not inliers >= _MIN_INLIERS else "biased landmarks"
+    # without a landmark, the number is NaN
+    name = "biased landmarks" if inliers >= _MIN_INLIERS else "few landmarks"
     text = "no landmarks matched" if math.isnan(inliers) else f"{inliers:.0f} landmarks per image (median)"
     return Cause(name, f"{text}, suns of map and image differ by {number(suns_deg)} deg")
 
@@ -234,7 +249,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 LOCALISATION = Presentation(
     cases=(CaseKind(is_localisation_case, view, _LEGEND),),
     first=(position_section,),
-    sections=(conditions_section,),
+    sections=(light_section,),
     outcomes=(PositionOutcome,),
     explain=explain,
 )

@@ -42,11 +42,11 @@ def map_section(subject: section.Subject) -> section.Section | None:
     rows = [
         ["images", str(counts["images"]), str(counts["rendered"])],
         ["images with a pose", str(counts["recorded_with_pose"]), str(counts["rendered_with_pose"])],
-        *([label(name), *map(_summarise, values)] for name, values in columns.items()),
+        *([label(name), *map(_summarize, values)] for name, values in columns.items()),
         [
             label(f"{RENDERED}pose_error_px"),
-            _summarise(np.empty(0)),
-            _summarise(numbers(frame, f"{RENDERED}pose_error_px")),
+            _summarize(np.empty(0)),
+            _summarize(numbers(frame, f"{RENDERED}pose_error_px")),
         ],
     ]
     figures = []
@@ -72,7 +72,7 @@ def _median(values: Float[np.ndarray, " n"]) -> float | None:
     return float(np.median(finite)) if finite.size else None
 
 
-def _summarise(values: Float[np.ndarray, " n"]) -> str:
+def _summarize(values: Float[np.ndarray, " n"]) -> str:
     """Format the median and the range of known values."""
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -84,7 +84,7 @@ def _summarise(values: Float[np.ndarray, " n"]) -> str:
 def yield_figure(frame: pd.DataFrame) -> Figure:
     """Draw the yield of each matcher over the height of recorded and rendered images."""
     figure = Figure(figsize=(9.0, 2.8), layout="constrained")
-    for axes, name, index in zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, range(4), strict=True):
+    for index, (axes, name) in enumerate(zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, strict=True)):
         for prefix, filling in (("", figure_style.SERIES[index]), (RENDERED, "none")):
             height, fraction = numbers(frame, prefix + "height_m"), numbers(frame, f"{prefix}{name}_yield")
             style = {"color": figure_style.SERIES[index], "markerfacecolor": filling, "markersize": 5.0}
@@ -111,14 +111,11 @@ def _panels(products: Products, kind: str) -> list[Panel]:
         return []
     if map_image is None or landmarks is None:
         return [Panel(image, title), Panel(text="no pose on the map")]
-    style = {
-        "marker": "o",
-        "linestyle": "none",
-        "markersize": 5.0,
-        "fillstyle": "none",
-        "color": figure_style.SERIES[1],
-    }
-    on_image, on_map = (Mark(landmarks[:, columns], style) for columns in ([0, 1], [2, 3]))
+    style = {"marker": "o", "linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
+    style["color"] = figure_style.SERIES[1]
+    # columns of the product: (u, v) in the image, (u, v) on the map, and score of the match
+    image_pixels, map_pixels, _ = np.split(landmarks, (2, 4), axis=1)
+    on_image, on_map = Mark(image_pixels, style), Mark(map_pixels, style)
     return [Panel(image, f"{title}, {len(landmarks)} landmarks", [on_image]), Panel(map_image, "Its map", [on_map])]
 
 

@@ -67,8 +67,9 @@ def read_matched_pairs(products: Products) -> list[MatchedPair]:
         table = check_shape(products.get(f"matches_{image_number}"), None, 7)
         first, second = (to_matrix(products.get(f"image_{image_number + offset}")) for offset in (0, 1))
         if table is not None and first is not None and second is not None:
-            pixels, is_inlier = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0
-            pairs.append(MatchedPair(image_number, (first, second), pixels, table[:, 4:6], is_inlier))
+            pixels, offsets, inlier = np.split(table, (4, 6), axis=1)
+            is_inlier = inlier[:, 0] > 0.0
+            pairs.append(MatchedPair(image_number, (first, second), pixels.reshape(-1, 2, 2), offsets, is_inlier))
     return pairs
 
 

@@ -108,13 +108,6 @@ class ClusteredCases:
             upper *= 2
         return bisect.bisect_left(range(upper), True, key=is_sufficient)
 
-    def _min_member_rate(self, risk: float) -> tuple[float, float]:
-        """Return the lower bound of the rate of members, and the part of the risk that it does not use."""
-        if self.member.all():
-            return 1.0, risk
-        max_other_rate = TerrainCounts.of(~self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
-        return 1.0 - max_other_rate, (1.0 - _MEMBER_RISK_FRACTION) * risk
-
     def min_failure_rate(self, risk: float) -> float:
         """Compute the lower bound of the failure rate in the population."""
         max_member_rate, other_risk = 1.0, risk
@@ -123,3 +116,10 @@ class ClusteredCases:
             other_risk = (1.0 - _MEMBER_RISK_FRACTION) * risk
         no_failure = TerrainCounts.of(~self.member | self.success, self.index)
         return (1.0 - no_failure.max_rate(other_risk)) / max_member_rate
+
+    def _min_member_rate(self, risk: float) -> tuple[float, float]:
+        """Return the lower bound of the rate of members, and the part of the risk that it does not use."""
+        if self.member.all():
+            return 1.0, risk
+        max_other_rate = TerrainCounts.of(~self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
+        return 1.0 - max_other_rate, (1.0 - _MEMBER_RISK_FRACTION) * risk

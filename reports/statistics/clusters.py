@@ -66,7 +66,8 @@ def largest_statistic(sizes: Sizes) -> int:
     return sum(terrains * int(scores[cases]) for cases, terrains in sizes)
 
 
-#: Factor of suppression of unresolved coefficients of a generating function; the rounding error is 1e-16 / this.
+#: Factor of suppression of unresolved coefficients of a generating function: the absolute error of a probability.
+#: Rounding errors of 1e-16 are divided by the square root of this factor.
 _ALIASING = 1e-10
 
 
@@ -142,7 +143,7 @@ class TailFunction:
 def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex128[np.ndarray, "*batch"]:
     """Raise to a positive power by repeated squaring, which is much faster than the power of complex numbers."""
     result = values
-    for digit in bin(exponent)[3:]:
+    for digit in f"{exponent:b}"[1:]:  # the binary digits after the first
         result = result * result * values if digit == "1" else result * result
     return np.asarray(result)
 
@@ -150,7 +151,7 @@ def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex12
 #: Relative positions of two support points: of the lower one between 0 and the mean, of the other between mean and 1.
 Pair = tuple[float, float]
 
-#: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
+#: Maximum number of values of one batch of distributions, and limits of the number of positions of a support point.
 _MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
 #: Range of the logits of support points in the search, number of its refinements, and of refined local maxima.
 _MAX_LOGIT, _REFINEMENTS, _MAX_STARTS = 7.0, 4, 4
@@ -227,6 +228,8 @@ def _max_rate(sizes: Sizes, statistic: int, risk: float) -> float:
             break
         # the rate with this p-value for the same pair; the least favourable pair there has a larger p-value
         rate = _solve_rate(tail, pair, rate, risk)
+        if rate == 1.0:
+            break
     return rate
 
 
@@ -240,8 +243,10 @@ def _solve_rate(tail: TailFunction, pair: Pair, rate: float, risk: float) -> flo
 
     start = float(special.logit(rate))
     stop = start + 1.0
-    while log_ratio(stop) > 0.0:
+    while special.expit(stop) < 1.0 and log_ratio(stop) > 0.0:
         stop += 1.0
+    if special.expit(stop) == 1.0:  # the rounding errors of the tail exceed the risk
+        return 1.0
     if log_ratio(start) <= 0.0:  # by rounding
         return rate
     return float(special.expit(optimize.brentq(log_ratio, start, stop, xtol=_TOLERANCE)))
@@ -273,22 +278,22 @@ def _find_supremum(sizes: Sizes, statistic: int, rate: float, sufficient: float 
     tail = TailFunction(sizes, statistic)
     grid = min(_MAX_GRID, max(_MIN_GRID, math.isqrt(_MAX_BATCH // tail.nodes.size)))
     # most points are close to 0, to the mean, and to 1
-    logits = special.expit(np.linspace(-_MAX_LOGIT, _MAX_LOGIT, grid))
-    x, y = np.concatenate([[0.0], logits, [1.0]]), np.append(logits, 1.0)
-    probabilities = tail.of_pairs(*_support(x, y, rate), rate)
+    positions = special.expit(np.linspace(-_MAX_LOGIT, _MAX_LOGIT, grid))
+    low, high = np.concatenate([[0.0], positions, [1.0]]), np.append(positions, 1.0)
+    probabilities = tail.of_pairs(*_support(low, high, rate), rate)
     is_maximum = probabilities == ndimage.maximum_filter(probabilities, 3, mode="nearest")
     starts = np.argwhere(is_maximum)
     order = np.argsort(-probabilities[tuple(starts.T)], kind="stable")[:_MAX_STARTS]
     row, column = starts[order[0]]
     if probabilities[row, column] > sufficient:
-        return min(float(probabilities[row, column]), 1.0), (float(x[row]), float(y[column]))
-    probability, pair = max(_refine(tail, rate, (x, y), (int(row), int(column))) for row, column in starts[order])
+        return min(float(probabilities[row, column]), 1.0), (float(low[row]), float(high[column]))
+    probability, pair = max(_refine(tail, rate, (low, high), (int(row), int(column))) for row, column in starts[order])
     return min(probability, 1.0), pair
 
 
-def _support(x: np.ndarray, y: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute support points below and above the mean from their relative positions between 0, the mean and 1."""
-    return x * rate, rate + y * (1.0 - rate)
+def _support(low: np.ndarray, high: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute support points below and above the mean `rate` from their relative positions (see `Pair`)."""
+    return low * rate, rate + high * (1.0 - rate)
 
 
 def _refine(

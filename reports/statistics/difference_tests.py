@@ -1,24 +1,14 @@
-"""Tests of the difference of two sets of cases: unpaired or paired, of rates or of errors, and Holm's correction.
+"""Tests of two sets of cases that are independent of each other (two campaigns), and Holm's correction.
 
-Unpaired sets (two campaigns): cases on one terrain are correlated. If both sets have cases on the same terrains, they
-are compared within each terrain, where cases are independent. Rates are compared by the exact distribution of Mantel
-and Haenszel's sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull.
-Inst. Int. Statist. 37, 1960). If they have few terrains in common, terrains are compared instead of cases: each terrain
-is represented by the mean of the same number of its cases. Small p-values of ranks are computed by permutation. With
-many ties (rates of a few cases per terrain, for example), the rank sum is skewed. At 0.001 the p-value of its normal
-approximation is then too small by a factor of two to three.
+Cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared within each
+terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's sum of
+hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist.
+37, 1960). If they have few terrains in common, terrains are compared instead of cases: each terrain is represented by
+the mean of the same number of its cases. Small p-values of ranks are computed by permutation. With many ties (rates of
+a few cases per terrain, for example), the rank sum is skewed. At 0.001 the p-value of its normal approximation is then
+too small by a factor of two to three.
 
-Paired sets (two algorithms, or two campaigns with the same draws): successes are compared by McNemar's test with the
-exact binomial distribution (Psychometrika 12, 1947). If cases share terrains, the sums of the differences on each
-terrain are ranked (Wilcoxon's signed ranks): under the null hypothesis these sums are symmetric about zero for any
-correlation within terrains.
-
-- Errors of two algorithms: the mean of their differences is tested by random changes of signs (Fisher), of the sums of
-  terrains if cases share terrains. Its interval contains the means that this test does not reject: their bounds are
-  quantiles of the means of random subsets (Hartigan, "Using subsample values as typical values", J. Amer. Statist.
-  Assoc. 64, 1969). Estimate, interval and p-value therefore refer to the same quantity. Both are exact if the two
-  algorithms are exchangeable, and accurate for the mean of many skewed differences.
-- Errors of two campaigns with the same draws: Wilcoxon's signed-rank test.
+`marsyard.reports.statistics.paired_tests` compares two results of the same cases.
 """
 
 from __future__ import annotations
@@ -29,11 +19,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import stats
-
-from marsyard.reports.statistics.clusters import number_terrains
-from marsyard.reports.statistics.samples import Groups, is_shared
 
 
 def correct_holm(p_values: Sequence[float]) -> list[float]:
@@ -56,7 +43,7 @@ _MAX_EXACT = 20_000
 _FULL_FRACTION = 0.8
 #: Permutations replace a p-value of the normal approximation below this value.
 _PERMUTATION_LIMIT = 0.05
-#: Fixed seed of permutations and random subsets, for reproducible reports, and their number per batch.
+#: Fixed seed of the permutations, for reproducible reports, and their number per batch.
 _SEED, _BATCH = 19370101, 500
 #: Number of exceedances at which the sampling of permutations stops; maximum number of permuted values.
 _MAX_EXCEEDANCES, _MAX_PERMUTED = 50, 2_000_000_000
@@ -140,32 +127,35 @@ def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000
 Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
+class _Table(NamedTuple):
+    """Successes of one pair: numbers of successes and cases of the first set, and of both sets together."""
+
+    first_successes: int
+    first_cases: int
+    successes: int
+    cases: int
+
+
 def _test_rates(pairs: Pairs) -> float:
     """Compute the exact two-sided p-value of rates, given the successes of each pair: twice the smaller tail."""
-    # for each pair: successes and cases of the first set, successes and cases of both sets
-    tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
-    tables = [table for table in tables if 0 < table[2] < table[3]]
+    all_tables = [_Table(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
+    # equal results of all cases of a pair do not depend on the set
+    tables = [table for table in all_tables if 0 < table.successes < table.cases]
     if not tables:
         return 1.0
-    observed_sum = sum(table[0] for table in tables)
-    if sum(min(size, successes) for _, size, successes, _ in tables) > _MAX_EXACT:
-        _, first_sizes, success_counts, case_counts = np.array(tables, dtype=np.float64).T
+    observed_sum = sum(table.first_successes for table in tables)
+    if sum(min(table.first_cases, table.successes) for table in tables) > _MAX_EXACT:
+        _, first_cases, successes, cases = np.array(tables, dtype=np.float64).T
         # mean and variance of the hypergeometric distribution; continuity correction of 0.5
-        variance = float(
-            (
-                first_sizes
-                * success_counts
-                * (case_counts - success_counts)
-                * (case_counts - first_sizes)
-                / (case_counts**2 * (case_counts - 1.0))
-            ).sum()
-        )
-        excess = max(0.0, abs(observed_sum - float((first_sizes * success_counts / case_counts).sum())) - 0.5)
-        return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
+        mean = float((first_cases * successes / cases).sum())
+        variances = first_cases * successes * (cases - successes) * (cases - first_cases) / (cases**2 * (cases - 1.0))
+        excess = max(0.0, abs(observed_sum - mean) - 0.5)
+        return float(2.0 * stats.norm.sf(excess / math.sqrt(float(variances.sum()))))
     distribution, minimum = np.ones(1), 0
-    for _, size, successes, cases in tables:
-        low, high = max(0, size + successes - cases), min(size, successes)
-        distribution = np.convolve(distribution, stats.hypergeom.pmf(np.arange(low, high + 1), cases, successes, size))
+    for _, size, success_count, case_count in tables:
+        low, high = max(0, size + success_count - case_count), min(size, success_count)
+        probabilities = stats.hypergeom.pmf(np.arange(low, high + 1), case_count, success_count, size)
+        distribution = np.convolve(distribution, probabilities)
         minimum += low
     index = observed_sum - minimum
     return float(min(1.0, 2.0 * min(distribution[: index + 1].sum(), distribution[index:].sum())))
@@ -206,107 +196,3 @@ def _test_ranks(pairs: Pairs, permutations: int) -> float:
         n_permutations += _BATCH
     # the observed order counts as one of the permutations
     return (exceedances + 1.0) / (n_permutations + 1.0)
-
-
-#: Maximum number of subsets of groups; maximum number of groups, above which a mean is normally distributed.
-_MAX_SUBSETS, _MAX_FLIPPED = 10_000, 2_000
-
-
-class SuccessDifference(NamedTuple):
-    """Numbers of cases where only the first and only the other succeeds, and the two-sided p-value."""
-
-    only_first: int
-    only_other: int
-    p_value: float
-
-
-class ErrorDifference(NamedTuple):
-    """Mean of paired differences, bounds of its interval, and the two-sided p-value of a mean of zero."""
-
-    mean: float
-    lower: float
-    upper: float
-    p_value: float
-
-
-def compare_successes(
-    first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"], groups: Groups = None
-) -> SuccessDifference:
-    """Compare the successes of the same cases."""
-    only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
-    if groups is not None and is_shared(groups):
-        p_value = _test_signed_ranks(_sum_groups(other.astype(np.float64) - first, groups))
-        return SuccessDifference(only_first, only_other, p_value)
-    total = only_first + only_other
-    p_value = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
-    return SuccessDifference(only_first, only_other, p_value)
-
-
-def compare_errors(differences: Float[np.ndarray, " n"], groups: Groups, confidence: float) -> ErrorDifference:
-    """Compute the mean of paired differences, its interval, and the two-sided p-value of a mean of zero.
-
-    Interval and p-value belong to one test: the interval contains zero if and only if the p-value is above
-    1 - confidence. NaN for no pairs; the interval is NaN for too few pairs (or terrains) for its confidence.
-    """
-    if differences.size == 0:
-        return ErrorDifference(math.nan, math.nan, math.nan, math.nan)
-    sums, sizes = differences, np.ones(differences.size)
-    if groups is not None and is_shared(groups):
-        sums, sizes = _sum_groups(differences, groups), _sum_groups(np.ones(differences.size), groups)
-    mean = float(differences.mean())
-    if sums.size > _MAX_FLIPPED:
-        error = math.sqrt(sums.size / (sums.size - 1.0) * float(((sums - mean * sizes) ** 2).sum())) / differences.size
-        half_width = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * error
-        p_value = 1.0 if mean == 0.0 else float(2.0 * stats.norm.sf(abs(mean) / error)) if error > 0.0 else 0.0
-        return ErrorDifference(mean, mean - half_width, mean + half_width, p_value)
-    low, high = _subset_means(sums, sizes)
-    # the bounds are the first means that the test does not reject; the tolerance is for rounding errors
-    index = math.floor(0.5 * (1.0 - confidence) * low.size + 1e-9)
-    lower, upper = float(low[index]), float(high[high.size - 1 - index])
-    n_exceedances = min(int((low <= 0.0).sum()), int((high >= 0.0).sum()))
-    p_value = min(1.0, 2.0 * n_exceedances / low.size)
-    if not math.isfinite(upper - lower):
-        lower = upper = math.nan
-    return ErrorDifference(mean, lower, upper, p_value)
-
-
-def _subset_means(
-    sums: Float[np.ndarray, " groups"], sizes: Float[np.ndarray, " groups"]
-) -> tuple[Float[np.ndarray, " subsets"], Float[np.ndarray, " subsets"]]:
-    """Compute the sorted means of random subsets of groups, for lower and for upper bounds.
-
-    The empty subset is the observed sample: its mean is minus infinity for lower bounds, and infinity for upper bounds.
-    All subsets are used if they are fewer than `_MAX_SUBSETS`.
-    """
-    n = sums.size
-    if 2**n <= _MAX_SUBSETS:
-        subsets = np.arange(1, 2**n)[:, None] >> np.arange(n) & 1
-        total, size = subsets @ sums, subsets @ sizes
-    else:
-        rng = np.random.default_rng(_SEED)
-        batches = [rng.integers(0, 2, (_BATCH, n), dtype=np.int8) for _ in range(_MAX_SUBSETS // _BATCH)]
-        total, size = (np.concatenate([batch @ values for batch in batches])[1:] for values in (sums, sizes))
-    is_empty = size == 0.0
-    means = np.divide(total, size, out=np.zeros(total.size), where=~is_empty)
-    return (
-        np.sort(np.append(np.where(is_empty, -math.inf, means), -math.inf)),
-        np.sort(np.append(np.where(is_empty, math.inf, means), math.inf)),
-    )
-
-
-def symmetry_p_value(differences: Float[np.ndarray, " n"], groups: Groups) -> float:
-    """Compute the two-sided p-value of paired differences that are symmetric about zero (signed ranks)."""
-    if groups is not None and is_shared(groups):
-        return _test_signed_ranks(_sum_groups(differences, groups))
-    return _test_signed_ranks(differences)
-
-
-def _sum_groups(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
-    """Sum the differences on each terrain."""
-    return np.bincount(number_terrains(groups), weights=differences)
-
-
-def _test_signed_ranks(differences: Float[np.ndarray, " n"]) -> float:
-    """Compute the p-value of Wilcoxon's signed-rank test without the zero differences; 1 if all are zero."""
-    nonzero = differences[differences != 0.0]
-    return 1.0 if nonzero.size == 0 else float(stats.wilcoxon(nonzero).pvalue)

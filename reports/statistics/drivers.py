@@ -7,6 +7,7 @@ two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +15,8 @@ from scipy import optimize, stats
 
 #: Minimum number of cases with condition and response for an estimate.
 MIN_CASES = 20
+#: Minimum number of pairs of a rank correlation without an interval.
+_MIN_PAIRS = 4
 #: Number of cases per bin for the fraction of variance, and the maximum number of bins.
 _CASES_PER_BIN, _MAX_BINS = 15, 20
 
@@ -81,10 +84,19 @@ def estimate_driver(
     )
 
 
+class _ExplainedFraction(NamedTuple):
+    """Fraction of a variance between bins, its interval, and the p-value of the F-test; see `Driver`."""
+
+    fraction: float
+    lower: float
+    upper: float
+    p_value: float
+
+
 def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective_n: float, confidence: float
-) -> tuple[float, float, float, float]:
-    """Estimate the fraction of the variance of y between bins of x, its interval, and the p-value of the F-test."""
+) -> _ExplainedFraction:
+    """Estimate the fraction of the variance of the ranks y between bins of the ranks x."""
     n = x.size
     max_bins = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
@@ -97,7 +109,7 @@ def _estimate_explained_fraction(
     total = float(((y - y.mean()) ** 2).sum())
     between = float((np.bincount(bin_index) * (means - y.mean()) ** 2).sum())
     if between >= (1.0 - 1e-9) * total:
-        return 1.0, 1.0, 1.0, 0.0
+        return _ExplainedFraction(1.0, 1.0, 1.0, 0.0)
     within_degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
     within = total - between
     f_ratio = between / (bins - 1.0) / (within / within_degrees)
@@ -113,9 +125,8 @@ def _estimate_explained_fraction(
         )
         return float(cdf) - level
 
-    bounds: list[float] = []
-    tail = 0.5 * (1.0 - confidence)
-    for level in (1.0 - tail, tail):
+    def find_fraction(level: float) -> float:
+        """Find the fraction of variance whose F ratio is at most the observed one with the probability `level`."""
         high = max(1.0, f_ratio * (bins - 1.0))
         while cdf_minus_level(high, level) > 0.0:
             high *= 2.0
@@ -124,8 +135,11 @@ def _estimate_explained_fraction(
         if cdf_minus_level(0.0, level) > 0.0:
             root = float(optimize.brentq(cdf_minus_level, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
             ratio_of_variances = root / effective_n
-        bounds.append(ratio_of_variances / (1.0 + ratio_of_variances))
-    return fraction, bounds[0], bounds[1], float(stats.f.sf(f_ratio, bins - 1.0, within_degrees))
+        return ratio_of_variances / (1.0 + ratio_of_variances)
+
+    tail = 0.5 * (1.0 - confidence)
+    p_value = float(stats.f.sf(f_ratio, bins - 1.0, within_degrees))
+    return _ExplainedFraction(fraction, find_fraction(1.0 - tail), find_fraction(tail), p_value)
 
 
 def _estimate_intraclass_correlation(
@@ -154,7 +168,7 @@ def mean_squares(values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"]) 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
     """Compute Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
     finite = np.isfinite(x) & np.isfinite(y)
-    if finite.sum() < 4:
+    if finite.sum() < _MIN_PAIRS:
         return float("nan")
     ranks_x, ranks_y = (stats.rankdata(values[finite]) for values in (x, y))
     return float("nan") if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0 else float(np.corrcoef(ranks_x, ranks_y)[0, 1])

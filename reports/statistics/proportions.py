@@ -1,4 +1,4 @@
-"""Success rates of independent cases: exact binomial bounds, and numbers of cases that they need.
+"""Success rates of independent cases: exact binomial bounds, consumer risk, and numbers of cases that they need.
 
 `marsyard.reports.statistics.clustered_cases` computes bounds for cases that share terrains.
 

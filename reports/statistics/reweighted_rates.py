@@ -34,6 +34,8 @@ Changes = Float64[np.ndarray, " changes"]
 MIN_EFFECTIVE = 30.0
 #: Smallest parameter of a beta distribution, if all units fail.
 _MIN_PARAMETER = 1e-9
+#: Smallest sum of weights: smaller weights were rounded to 0.
+_MIN_SUM = 1e-9
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def weighted_rates(
 ) -> WeightedRates:
     """Compute the failure rates of the cases of a population for the weights of each change.
 
-    - failure: of each case, for each change if it depends on it
+    - weights: of each case for each change; those of the first change are the weights without a change
+    - failure: whether each case fails, for each change if it depends on it
     - groups: number of each case's terrain; None for independent cases
     - confidences: of the lower and of the upper bound
     - max_weights: largest possible weight of a unit if it is known; otherwise, the largest one of these units is used
@@ -69,7 +72,7 @@ def weighted_rates(
     """
     unit, failing = _sum_groups(weights, groups), _sum_groups(weights * failure, groups)
     units = unit.shape[1]
-    is_known = unit.sum(axis=1) > _MIN_PARAMETER  # small weights are rounded to 0
+    is_known = unit.sum(axis=1) > _MIN_SUM
     unit = np.where(is_known[:, None], unit, 1.0)
     scale = units / unit.sum(axis=1)
     total, square = scale * failing.sum(axis=1), scale**2 * (failing**2).sum(axis=1)
@@ -78,8 +81,9 @@ def weighted_rates(
     square = np.maximum(square, ratio_square / np.maximum(1.0 - rate[:, 0], 1.0 / units))
     largest = scale * np.maximum(unit.max(axis=1), max_weights)
     has_failure = square > 0.0
-    counted = np.where(has_failure, total, 1.0), np.where(has_failure, square, 1.0)
-    lower = np.where(has_failure, _bound(*counted, units, 1.0 - confidences[0]), 0.0)
+    # any positive numbers where no case failed
+    known_total, known_square = np.where(has_failure, total, 1.0), np.where(has_failure, square, 1.0)
+    lower = np.where(has_failure, _bound(known_total, known_square, units, 1.0 - confidences[0]), 0.0)
     upper = _bound(total + largest, square + largest**2, units, confidences[1])
     effective = is_known * units**2 / (scale**2 * (unit**2).sum(axis=1))
     return WeightedRates(total / units, lower, np.minimum(upper, 1.0), np.minimum(effective, efficiency * effective[0]))
@@ -103,13 +107,14 @@ def _sum_groups(
 
 
 #: Rounding error of a rate that is compared with a limit.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Sizes of a change at which upper bound (`lower`), estimate (`change`) and lower bound (`upper`) reach a limit.
+    """Sizes of a change at which the upper bound, the estimate and the lower bound of a failure rate reach a limit.
 
+    - change: size at which the estimate reaches it; lower, upper: bounds of this size, from upper and lower bound
     - lower: `reach` if the upper bound stays below the limit; NaN if it exceeds the limit without a change
     - change, upper: NaN if they do not reach the limit
     - reach: largest size with `MIN_EFFECTIVE` effective units; effective_cases: their number at `change`, or at `reach`
@@ -133,24 +138,30 @@ def find_crossing(sizes: Changes, rates: WeightedRates, limit: float, *, decides
     if not count:
         return Crossing(math.nan, math.nan, math.nan, 0.0, float(rates.effective_units[0]))
     reach = float(sizes[count - 1])
-    lost, change, shown = (
-        _first_above(sizes[:count], values[:count], limit)
-        for values in (rates.estimate if decides_by_rate else rates.upper, rates.estimate, rates.lower)
+    decisive = rates.estimate if decides_by_rate else rates.upper
+    lower, change, upper = (
+        _first_above(sizes[:count], values[:count], limit) for values in (decisive, rates.estimate, rates.lower)
     )
-    lower = math.nan if lost == 0.0 else reach if math.isnan(lost) else lost
+    if decisive[0] > limit + ROUNDING:
+        lower = math.nan
+    elif math.isnan(lower):
+        lower = reach
     size = reach if math.isnan(change) else change
-    return Crossing(change, lower, shown, reach, float(np.interp(size, sizes, rates.effective_units)))
+    return Crossing(change, lower, upper, reach, float(np.interp(size, sizes, rates.effective_units)))
 
 
 def _first_above(sizes: Changes, values: Changes, limit: float) -> float:
-    """Find the smallest size whose value exceeds a limit, by linear interpolation; NaN if there is none."""
-    above = np.flatnonzero(values > limit + _ROUNDING)
+    """Find the smallest size whose value exceeds a limit, by linear interpolation; NaN if there is none.
+
+    The first size is 0, without a change.
+    """
+    above = np.flatnonzero(values > limit + ROUNDING)
     if not above.size:
         return math.nan
-    last = int(above[0])
-    if last == 0:
+    first = int(above[0])
+    if first == 0:
         return 0.0
-    return float(np.interp(limit, values[last - 1 : last + 1], sizes[last - 1 : last + 1]))
+    return float(np.interp(limit, values[first - 1 : first + 1], sizes[first - 1 : first + 1]))
 
 
 def population_divergence(rate: float, reference: float, member_rate: float) -> float:

@@ -33,7 +33,8 @@ from marsyard.reports.statistics.proportions import Interval, check_confidence
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
 _MAX_BOOTSTRAP = 2000
-_N_RESAMPLES = 2000
+#: Number of resamples of a bootstrap, and of those that are computed together, which limits the memory.
+_N_RESAMPLES, _BATCH = 2000, 200
 #: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 19340401
 #: Minimum number of terrains, and of independent values, for intervals of a mean and of a standard deviation. The
@@ -63,7 +64,7 @@ def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[...,
             # below 1, as SciPy requires
             confidence_level=min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6),
             n_resamples=_N_RESAMPLES,
-            batch=200,
+            batch=_BATCH,
             vectorized=True,
             method="BCa",
             rng=np.random.default_rng(_SEED),
@@ -174,7 +175,7 @@ def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Inte
     trimmed_mean = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
     squares = float(((values - values.mean()) ** 2).sum())
     kurtosis = n * float(((values - trimmed_mean) ** 4).sum()) / squares**2
-    correction = n / (n - quantile)
+    correction = n / max(n - quantile, 1.0)
     standard_error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
     centre = math.log(correction * squares / (n - 1.0))
     return math.exp(0.5 * (centre - quantile * standard_error)), math.exp(0.5 * (centre + quantile * standard_error))

@@ -12,6 +12,8 @@ from scipy import special, stats
 
 #: Minimum risk, since a confidence closer to 1 would be rounded to 1.
 _MIN_RISK = 1e-12
+#: Accuracy of a number of events, as a fraction of the number of cases.
+_ACCURACY = 1e-9
 #: Minimum number of cases of the first look, and maximum number of looks.
 _MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
 
@@ -92,7 +94,7 @@ class SequentialTest:
             return max(_MIN_RISK, min(self.risk, math.exp(log_risk)))
         # bisection for the largest number of events that supports the verdict
         min_events, max_events = 0.0, float(n)
-        while max_events - min_events > 1e-9 * max(1.0, n):
+        while max_events - min_events > _ACCURACY * max(1.0, n):
             events = 0.5 * (min_events + max_events)
             is_supported = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
             min_events, max_events = (events, max_events) if is_supported else (min_events, events)

@@ -1,4 +1,4 @@
--- Tables of the history of nights, see `marsyard.reports.nightly`.
+-- Tables of the history of nights, see `marsyard.reports.night_history`.
 CREATE TABLE nights (
     night INTEGER PRIMARY KEY, started_utc TEXT NOT NULL, finished_utc TEXT, state TEXT NOT NULL, git_commit TEXT
 );

@@ -1,5 +1,7 @@
 """Perspective view of a case: ground, true and estimated path, cameras and points."""
 
+import math
+
 import cv2
 import numpy as np
 from jaxtyping import Bool
@@ -33,7 +35,7 @@ def draw_timeline(timeline: Timeline) -> Figure:
     for name, path in timeline.paths.items():
         line = "-" if name == "true" else "--"
         axes.plot(*(path.positions_m - origin).T, line, color=_rgb(name), lw=1.4, label=f"{name} path", zorder=3)
-    stride = max(1, -(-len(timeline.images) // _MAX_CAMERAS))
+    stride = max(1, math.ceil(len(timeline.images) / _MAX_CAMERAS))
     edges = [camera_outlines(image, float((high - low)[:2].max())) - origin for image in timeline.images[::stride]]
     if edges:
         outlines = Line3DCollection(np.concatenate(edges), colors=[MUTED], linewidths=0.6, zorder=4, label="cameras")
@@ -54,6 +56,7 @@ def draw_timeline(timeline: Timeline) -> Figure:
 
 
 def _rgb(name: str) -> tuple[float, float, float]:
+    """Return the colour of a path or of points for Matplotlib, 0 to 1."""
     red, green, blue = (value / 255.0 for value in colour(name))
     return red, green, blue
 

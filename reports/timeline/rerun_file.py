@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -105,7 +106,8 @@ def _log_image(recording: rr.RecordingStream, image: TimedImage, width_m: float)
         )
     for name, boxes in image.boxes.items():
         finite = boxes[np.isfinite(boxes).all(axis=1)]
-        rectangles = rr.Boxes2D(mins=finite[:, :2] + 0.5, sizes=finite[:, 2:], colors=[colour(name)])
+        left_upper, width_height = np.split(finite, 2, axis=1)
+        rectangles = rr.Boxes2D(mins=left_upper + 0.5, sizes=width_height, colors=[colour(name)])
         recording.log(f"{entity}/{rr.escape_entity_path_part(name)}", rectangles)
 
 
@@ -146,8 +148,8 @@ def _log_series(recording: rr.RecordingStream, timeline: Timeline) -> None:
             }
     for entity, (times_s, values) in columns.items():
         is_finite = np.isfinite(values)
-        index = rr.TimeColumn(_TIME, duration=times_s[is_finite])
-        recording.send_columns(entity, [index], rr.Scalars.columns(scalars=values[is_finite]))
+        times = rr.TimeColumn(_TIME, duration=times_s[is_finite])
+        recording.send_columns(entity, [times], rr.Scalars.columns(scalars=values[is_finite]))
 
 
 def _create_blueprint(timeline: Timeline) -> rrb.Blueprint:
@@ -161,7 +163,7 @@ def _create_blueprint(timeline: Timeline) -> rrb.Blueprint:
     plots = [rrb.TimeSeriesView(origin=_entity("series", name), name=name) for name in timeline.series]
     if timeline.inertial is not None:
         plots += [rrb.TimeSeriesView(origin="inertial", name="inertial unit")]
-    right = [part for part in (rrb.Tabs(*images) if len(images) > 1 else None, *images[: len(images) == 1]) if part]
+    right: list[Any] = [rrb.Tabs(*images)] if len(images) > 1 else list(images)
     right += [rrb.Tabs(*plots)] if plots else []
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*space), rrb.Vertical(*right), column_shares=[3, 2]), collapse_panels=True

@@ -80,7 +80,7 @@ class _BagWriter:
             rows = zip(data.times_s, data.rates_rad_s, data.specific_forces_m_s2, strict=True)
             for time_s, rate, force in rows:
                 stamp, header = self._header(float(time_s), _BODY)
-                unknown = np.array([-1.0, *np.zeros(8)])  # no attitude is measured
+                unknown = np.array([-1.0, *np.zeros(8)])  # ROS's sign that no attitude is measured
                 message = self._type("sensor_msgs/msg/Imu")(
                     header=header,
                     orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
@@ -136,6 +136,7 @@ class _BagWriter:
         yield self._transform(header.frame_id, *pose)
 
     def _pose(self, topic: str, time_s: float, position: np.ndarray, quaternion: np.ndarray) -> tuple[int, str, Any]:
+        """Return stamp, topic and message of a pose in the world."""
         stamp, header = self._header(time_s, _WORLD)
         pose = self._type("geometry_msgs/msg/Pose")(
             position=self._type("geometry_msgs/msg/Point")(*position.tolist()), orientation=self._quaternion(quaternion)
@@ -145,7 +146,7 @@ class _BagWriter:
     def _transform(
         self, frame: str, time_s: float, position: np.ndarray, quaternion: np.ndarray
     ) -> tuple[int, str, Any]:
-        """Return the pose of a frame in the world as a transform for `/tf`."""
+        """Return stamp, topic and message of the pose of a frame in the world, as a transform for `/tf`."""
         stamp, header = self._header(time_s, _WORLD)
         transform = self._type("geometry_msgs/msg/Transform")(
             translation=self._type("geometry_msgs/msg/Vector3")(*position.tolist()),

@@ -96,8 +96,9 @@ def _stop_panels(stop: StopImages, side_px: float) -> tuple[Panel, Panel, Panel]
     """
     corner, target = stop.corners[0], stop.matches[0] - stop.corners[0]
     marks = square(target, side_px, _TARGET_STYLE)
-    if np.isfinite([*stop.window, *corner]).all():
-        marks.insert(0, box(stop.window[:2] - corner - 0.5, stop.window[2:], _WINDOW_STYLE))
+    if np.isfinite([*stop.window_corner, *stop.window_size, *corner]).all():
+        # the edge of a pixel is half a pixel from its centre
+        marks.insert(0, box(stop.window_corner - corner - 0.5, stop.window_size, _WINDOW_STYLE))
     point = stop.point - corner
     if ((point >= -0.5) & (point <= np.array(stop.left.shape[::-1]) - 0.5)).all():
         marks.append(Mark(point[None], _TRUTH_STYLE))

@@ -19,7 +19,7 @@ class StopImages:
 
     - number: number of the stop, from 1; state: state of the tracker
     - corners: upper left pixels of the left and the right subframe
-    - window: upper left pixel, columns and rows of the search window in the left frame
+    - window_corner, window_size: upper left pixel, and columns and rows, of the search window in the left frame
     - matches: positions of the match in the left and the right frame
     - point: true projection of the designated point in the left frame
     - quantities: quantities of the update by name
@@ -30,7 +30,8 @@ class StopImages:
     left: Image
     right: Image | None
     corners: Float[np.ndarray, "2 2"]
-    window: Float[np.ndarray, "4"]
+    window_corner: Float[np.ndarray, "2"]
+    window_size: Float[np.ndarray, "2"]
     matches: Float[np.ndarray, "2 2"]
     point: Float[np.ndarray, "2"]
     quantities: Mapping[str, float]
@@ -89,16 +90,20 @@ def read_stops(products: Products) -> list[StopImages]:
         if left is None:
             return stops
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
-        shapes = {"corners": (2, 2), "window": (4,), "matches": (2, 2), "point": (2,)}
-        pixels = [_read_or_nan(products.get(f"stop_{number}_{name}"), *shape) for name, shape in shapes.items()]
+        prefix = f"stop_{number}_"
+        window_corner, window_size = _read_or_nan(products.get(f"{prefix}window"), 4).reshape(2, 2)
         stops.append(
             StopImages(
                 number=number,
                 state=str(state).replace("_", " ").lower(),
                 left=left,
-                right=to_matrix(products.get(f"stop_{number}_right")),
+                right=to_matrix(products.get(f"{prefix}right")),
+                corners=_read_or_nan(products.get(f"{prefix}corners"), 2, 2),
+                window_corner=window_corner,
+                window_size=window_size,
+                matches=_read_or_nan(products.get(f"{prefix}matches"), 2, 2),
+                point=_read_or_nan(products.get(f"{prefix}point"), 2),
                 quantities={name: float(array[number - 1]) for name, array in arrays.items() if number <= array.size},
-                **dict(zip(shapes, pixels, strict=True)),
             )
         )
     return stops

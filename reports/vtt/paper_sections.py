@@ -15,9 +15,10 @@ from marsyard.reports import populations, rates
 from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import paper_section
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.vtt.accuracy_sections import losses_grid, losses_note, table_1_section
+from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.vtt.goal_section import losses_grid, losses_note
 from marsyard.reports.vtt.steps_section import steps_section
+from marsyard.reports.vtt.table_1_section import table_1_section
 from marsyard.reports.vtt.tracking_runs import (
     CHECKOUT_1,
     CHECKOUT_3,
@@ -179,22 +180,20 @@ def regression_section(subject: Subject) -> Section | None:
     rows_with_labels = frame.assign(
         driving=driving_text, rock=np.where(numbers(frame, "rock_height_m") <= MAX_SMALL_ROCK_M, "small", "large")
     )
-    grid = build_grid(
-        list(rows_with_labels.groupby(["driving", "rock", "incline"], sort=True)),
-        {
-            "Driving": lambda group: str(group[0][0]),
-            "Rock": lambda group: str(group[0][1]),
-            "Ground": lambda group: str(group[0][2]),
-            "Runs": lambda group: f"{len(group[1]):,}",
-            "Tracked to the goal": lambda group: rates.fraction_text(rates.flag_fraction(group[1], "tracked")),
-            "Outcomes": lambda group: ", ".join(sorted(str(outcome) for outcome in group[1]["outcome"].unique())),
-            "Position error (cm)": lambda group: rates.median_text(
-                rates.finite_values(group[1], "position_error_m", 100.0), 2
-            ),
-            "Drift (px)": lambda group: rates.median_text(rates.finite_values(group[1], "drift_px"), 1),
-            "Navigation updates": lambda group: rates.median_text(rates.finite_values(group[1], "autonav_updates"), 0),
-        },
-    )
+    rows = [
+        [
+            *map(str, labels),
+            f"{len(runs):,}",
+            rates.fraction_text(rates.flag_fraction(runs, "tracked")),
+            ", ".join(sorted(str(outcome) for outcome in runs["outcome"].unique())),
+            rates.median_text(rates.finite_values(runs, "position_error_m", 100.0), 2),
+            rates.median_text(rates.finite_values(runs, "drift_px"), 1),
+            rates.median_text(rates.finite_values(runs, "autonav_updates"), 0),
+        ]
+        for labels, runs in rows_with_labels.groupby(["driving", "rock", "incline"], sort=True)
+    ]
+    head = ["Driving", "Rock", "Ground", "Runs", "Tracked to the goal", "Outcomes", "Position error (cm)", "Drift (px)"]
+    grid = Grid([*head, "Navigation updates"], rows)
     note = (
         "According to the paper, all 14 runs were successful. Small rocks are at most 10 cm high. Position error "
         "(rover frame) and drift are those at the goal. Drift: distance from the match to the true projection. The "

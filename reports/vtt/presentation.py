@@ -8,28 +8,24 @@ from marsyard.algorithms.vtt.arm import HandOffOutcome
 from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products
-from marsyard.reports.vtt.accuracy_sections import goal_section
 from marsyard.reports.vtt.case_figures import draw_path, draw_stops
 from marsyard.reports.vtt.case_products import is_vtt_case, read_rover_path, read_stops
+from marsyard.reports.vtt.goal_section import goal_section
 from marsyard.reports.vtt.paper_sections import DEFINITIONS, SECTIONS
-from marsyard.reports.wording import NOTHING, label, number, percent
+from marsyard.reports.wording import NOTHING, number, percent
 from marsyard.scenarios.rover.run_state import RunOutcome
 
 #: Maximum number of stops with images on the page.
 _MAX_STOPS = 8
-#: Quantities of an update in the order of the table.
-_QUANTITIES = (
-    "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
-    "stereo_score", "correction_px", "error_px", "position_error_m",
-)  # fmt: skip
-#: Headings and numbers of decimals of the table.
-_HEADS = {
+#: Quantities of an update in the order of the table, with their headings.
+_HEADINGS = {
     "range_m": "Range (m)", "azimuth_deg": "Mast azimuth (deg)", "elevation_deg": "Mast elevation (deg)",
     "magnification": "Magnification", "roll_change_deg": "Roll change (deg)",
     "azimuth_change_deg": "Azimuth change of the line of sight (deg)", "match_score": "NCC score",
     "stereo_score": "Stereo score", "correction_px": "Correction (px)", "error_px": "Tracking error (px)",
     "position_error_m": "Position error (cm)",
 }  # fmt: skip
+#: Numbers of decimals that are not 2.
 _DIGITS = {"magnification": 3, "correction_px": 1}
 _CAPTION = (
     "Each stop: left subframe (large), enlarged target (above right), and right subframe (below right) around the "
@@ -62,7 +58,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
     figures = [CaseFigure("stops", draw_stops(products, None if complete else _MAX_STOPS), " ".join(captions))]
     if read_rover_path(products) is not None:
         figures.append(CaseFigure("way", draw_path(products), _PATH_CAPTION))
-    names = [name for name in _QUANTITIES if any(name in stop.quantities for stop in stops)]
+    names = [name for name in _HEADINGS if any(name in stop.quantities for stop in stops)]
     # without a loss, the tracker's state does not vary
     shows_state = any(stop.state not in ("", "normal") for stop in stops)
     rows = []
@@ -70,7 +66,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
         texts = [str(stop.number), *([stop.state or NOTHING] if shows_state else [])]
         texts += [_format(name, stop.quantity(name)) for name in names]
         rows.append(TableRow(texts, stop.is_matched))
-    head = ["Stop", *(["State"] if shows_state else []), *(_HEADS.get(name, label(name)) for name in names)]
+    head = ["Stop", *(["State"] if shows_state else []), *(_HEADINGS[name] for name in names)]
     return CaseView(figures, head=head, rows=rows)
 
 

@@ -4,6 +4,7 @@ A step is the motion of the rover from one image to the next: an angle, or a fra
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +21,8 @@ from marsyard.reports.wording import NOTHING, format_fraction, note_text, number
 #: that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
+#: Maximum difference of a step from that of a result of the paper, degrees or per cent.
+_MAX_STEP_DIFFERENCE = 0.5
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -35,35 +38,35 @@ def steps_section(subject: Subject) -> Section | None:
     lines = [
         RateLine(
             name,
-            [cell["step"] for cell in line_cells],
-            [cell["good"] for cell in line_cells],
-            {cell["step"]: cell["paper_percent"] / 100.0 for cell in line_cells if cell["paper_percent"] is not None},
+            [cell.step for cell in line_cells],
+            [cell.good for cell in line_cells],
+            {cell.step: cell.paper_percent / 100.0 for cell in line_cells if cell.paper_percent is not None},
         )
-        for name in dict.fromkeys(cell["line"] for cell in steps)
-        if (line_cells := [cell for cell in steps if cell["line"] == name and cell["good"].n])
+        for name in dict.fromkeys(cell.line for cell in steps)
+        if (line_cells := [cell for cell in steps if cell.line == name and cell.good.n])
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
     caption = f"Selectable targets that are tracked to the end, with {format_fraction(CONFIDENCE)} intervals."
-    columns: dict[str, Callable[[dict[str, Any]], str]] = {
-        f"Step ({unit})": lambda cell: number(cell["step"]).rstrip("0").rstrip("."),
-        "Tracked, of selectable": lambda cell: rates.fraction_text(cell["good"]),
-        f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell["good"]),
-        "Tracked, of all targets": lambda cell: rates.fraction_text(cell["all_targets"]),
-        "False track, of selectable": lambda cell: rates.fraction_text(cell["false_tracks"]),
+    columns: dict[str, Callable[[StepRates], str]] = {
+        f"Step ({unit})": lambda cell: number(cell.step).rstrip("0").rstrip("."),
+        "Tracked, of selectable": lambda cell: rates.fraction_text(cell.good),
+        f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell.good),
+        "Tracked, of all targets": lambda cell: rates.fraction_text(cell.all_targets),
+        "False track, of selectable": lambda cell: rates.fraction_text(cell.false_tracks),
     }
-    if any(cell["line"] for cell in steps):
-        name = "Search window" if str(steps[0]["line"]).endswith("px") else "Tracker"
-        columns = {name: lambda cell: cell["line"], **columns}
+    if any(cell.line for cell in steps):
+        name = "Search window" if steps[0].line.endswith("px") else "Tracker"
+        columns = {name: lambda cell: cell.line, **columns}
     if any(line.paper for line in lines):
         caption += " Open marks: text of the paper."
         columns["Paper, of selectable"] = lambda cell: (
-            NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']:.0f} %"
+            NOTHING if cell.paper_percent is None else f"{cell.paper_percent:.0f} %"
         )
     grid = build_grid(steps, columns)
     svg_figures = [svg_figure(rate_figure(lines, (xlabel, "targets tracked")), "steps", caption)]
     blocks = [Block(text=motion["text"], figures=svg_figures), Block(grid=grid, note=_STEPS_NOTE)]
-    oblique = _obliquity_grid(subject.frame, "%" if motion["per_cent"] else "deg")
+    oblique = _obliquity_grid(subject.frame, per_cent=bool(motion["per_cent"]))
     if oblique is not None:
         blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=note_text("vtt.obliquity")))
     return Section("steps", "Steps", motion["title"], blocks, {"cells": steps})
@@ -76,13 +79,26 @@ def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
     return motions.get(str(drive_legs[0].get("motion", "approach"))) if len(drive_legs) == 1 else None
 
 
-def step_rates(subject: Subject) -> list[dict[str, Any]]:
-    """Compute the rates of tracked targets for every line (tracker or search window) and step size.
+@dataclass(frozen=True)
+class StepRates:
+    """Rates of tracked targets of a line (tracker or search window; empty for a single one) at a step size.
 
     - step: angle in degrees, or fraction of the distance to the target in per cent
     - good, false_tracks: fractions of the selectable targets that are tracked, and that have a false track
     - all_targets: fraction of all targets that are tracked
+    - paper_percent: percentage of tracked targets in the paper; None without one
     """
+
+    line: str
+    step: float
+    good: rates.CaseFraction
+    all_targets: rates.CaseFraction
+    false_tracks: rates.CaseFraction
+    paper_percent: float | None
+
+
+def step_rates(subject: Subject) -> list[StepRates]:
+    """Compute the rates of tracked targets for every line and step size."""
     frame, motion = subject.frame, _read_motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame:
         return []
@@ -92,17 +108,18 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
         for _, step_rows in line_rows.groupby("step"):
             step = float(step_rows["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             selectable_rows = selectable_targets(step_rows)
+            paper_percentages = (
+                percentage for size, percentage in paper.items() if abs(step - float(size)) < _MAX_STEP_DIFFERENCE
+            )
             cells.append(
-                {
-                    "line": line,
-                    "step": step,
-                    "good": rates.flag_fraction(selectable_rows, "tracked"),
-                    "all_targets": rates.flag_fraction(step_rows, "tracked"),
-                    "false_tracks": rates.flag_fraction(selectable_rows, "no_false_track", value=False),
-                    "paper_percent": next(
-                        (percentage for size, percentage in paper.items() if abs(step - float(size)) < 0.5), None
-                    ),
-                }
+                StepRates(
+                    line=line,
+                    step=step,
+                    good=rates.flag_fraction(selectable_rows, "tracked"),
+                    all_targets=rates.flag_fraction(step_rows, "tracked"),
+                    false_tracks=rates.flag_fraction(selectable_rows, "no_false_track", value=False),
+                    paper_percent=next(paper_percentages, None),
+                )
             )
     return cells
 
@@ -119,10 +136,11 @@ def _group_by_line(frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield name, frame[frame[column].eq(value)]
 
 
-def _obliquity_grid(frame: pd.DataFrame, unit: str) -> Grid | None:
+def _obliquity_grid(frame: pd.DataFrame, *, per_cent: bool) -> Grid | None:
     """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities.
 
     Trackers have separate rows; search windows are pooled.
+    per_cent: whether steps are fractions of the distance to the target, not degrees
     """
     if "obliquity_max_deg" not in frame:
         return None
@@ -137,6 +155,6 @@ def _obliquity_grid(frame: pd.DataFrame, unit: str) -> Grid | None:
                 fractions = [rates.flag_fraction(class_rows[class_rows["step"].eq(step)], "tracked") for step in steps]
                 cells = [f"{low:g} to {high:g}", *(f"{fraction.hits:,} of {fraction.n:,}" for fraction in fractions)]
                 rows.append([name, *cells] if has_trackers else cells)
-    scale = 100.0 if unit == "%" else 1.0
+    scale, unit = (100.0, "%") if per_cent else (1.0, "deg")
     head = ["Maximum obliquity (deg)", *(f"{scale * step:.3g} {unit}" for step in steps)]
     return Grid(["Tracker", *head] if has_trackers else head, rows) if rows else None

@@ -10,7 +10,7 @@ from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
 from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.parameters import bounded_field
-from marsyard.sim.sensor.gps import Outage
+from marsyard.sim.sensor.rtk import Outage
 
 
 class LandingFaults(SizedFaults):

@@ -13,7 +13,6 @@ from marsyard.sim.dynamics import State, Trajectory, rotorcraft
 from marsyard.sim.error_sources import COMPASS, INERTIAL, RECEIVER
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.sensor.gps import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.helicopter_navigation import (
     FilterParameters,
     FilterState,
@@ -22,6 +21,7 @@ from marsyard.sim.sensor.helicopter_navigation import (
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
+from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 

@@ -13,6 +13,7 @@ from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend, RenderingError
+from marsyard.sim.render.cones import Bounds
 from marsyard.sim.render.pixel_rays import VIEW_SIDES_PX
 from marsyard.sim.render.shading import GROUND
 from marsyard.sim.terrain import Surface
@@ -130,7 +131,7 @@ def _map_scene(
     orbit_height_m: float,
 ) -> Scene:
     """Create the scene of the orbital images: the ground without rocks, which are smaller than a map pixel."""
-    bounds = float(east.min()), float(east.max()), float(north.min()), float(north.max())
+    bounds = Bounds(float(east.min()), float(east.max()), float(north.min()), float(north.max()))
     # the renderer traces rays up to twice the half width of the mesh: 1.1 times the height of the orbiter
     half_width_m = 0.55 * orbit_height_m
     half_lines = int(np.arcsinh(half_width_m / _MESH_M * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH)

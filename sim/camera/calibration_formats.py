@@ -85,10 +85,9 @@ def read_stereo_pipeline(source: Source, size: tuple[int, int] | None) -> Values
 
     The lens model TSAI is OpenCV's. `size` is (columns, rows) of the image. Raises CameraFileError.
     """
-    lines = source.read_text().splitlines()
     terms: dict[str, str] = {}
     lens = "NULL"
-    for line in lines[2:]:
+    for line in source.read_text().partition("PINHOLE")[2].splitlines():
         match = _ASSIGNMENT.match(line)
         if match is not None:
             terms[match["name"]] = match["value"]

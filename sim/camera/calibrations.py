@@ -244,9 +244,10 @@ class _Reader:
 
     def read_size(self) -> tuple[int, int]:
         """Read (columns, rows)."""
-        pair = next((self.data[name] for name in ("resolution", "image_size", "imageSize") if name in self.data), None)
-        for width, height in _SIZES:
-            pair = pair if pair not in (None, [None, None]) else [self.data.get(width), self.data.get(height)]
+        missing = (None, [None, None])
+        pairs: list[Any] = [self.data.get(name) for name in ("resolution", "image_size", "imageSize")]
+        pairs += [[self.data.get(width), self.data.get(height)] for width, height in _SIZES]
+        pair = next((pair for pair in pairs if pair not in missing), None)
         if isinstance(pair, Mapping):
             pair = [pair.get("width"), pair.get("height")]
         match pair:
@@ -254,7 +255,7 @@ class _Reader:
                 return columns, rows
         raise self.error(
             "image_width, image_height or resolution",
-            "missing" if pair in (None, [None, None]) else f"{pair!r}",
+            "missing" if pair in missing else f"{pair!r}",
             "two positive integers, columns and rows",
         )
 

@@ -25,7 +25,7 @@ def read_cameras(
     - subframe_folded_in: accept PDS labels of subframes and averaged pixels; the vectors are assumed to describe the
       stored image
     - size: (columns, rows) of the image, required for files that do not contain it: JPL text files without the line
-      Dimensions, and models of Ames Stereo Pipeline
+      Dimensions, and models of Ames Stereo Pipeline; a camera of other files must have this size
 
     Models of PDS labels are returned in the vehicle's frame if the label contains the transform to it, else in the
     site's or the Mars-fixed frame; `read_framed_cameras` also returns the frame. Raises CameraFileError if the file
@@ -44,7 +44,19 @@ def read_framed_cameras(
     Files other than PDS labels do not name the frame; their models are assumed to be in the vehicle's frame.
     """
     source = Source(str(path))
-    leading_bytes = source.read_head(HEAD_BYTES)
+    cameras = _read_any_format(source, subframe_folded_in, size)
+    sizes = sorted({framed.camera.size for framed in cameras})
+    if size is not None and size not in sizes:
+        allowed = " or ".join(f"{columns} x {rows}" for columns, rows in sizes)
+        raise source.error("size", f"{size[0]} x {size[1]}", f"{allowed}, the size in the file")
+    return cameras
+
+
+def _read_any_format(
+    source: Source, subframe_folded_in: bool, size: tuple[int, int] | None
+) -> tuple[FramedCamera, ...]:
+    """Detect the format of a file and read its cameras; `size` is used only for files without the image's size."""
+    path, leading_bytes = source.path, source.read_head(HEAD_BYTES)
     if is_pds3(leading_bytes):
         return read_pds3(path, subframe_folded_in=subframe_folded_in)
     refuse_foreign(source, leading_bytes)

@@ -25,13 +25,9 @@ _LINES = ("Model", "Dimensions", "C", "A", "H", "V")
 #: Descriptions of the frames of reference, written into the files.
 BODY_FRAME = "body (metres); the file next to this one contains the body's pose in the world if it is known"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
-#: Value of the line Model, by the name of the class or by the linearity of a CAHVORE camera.
-_TYPE_NAMES = {
-    "CAHV": "CAHV = perspective, linear",
-    "CAHVOR": "CAHVOR = perspective, distortion",
-    1.0: "CAHVORE1 = perspective, distortion, pupil",
-    0.0: "CAHVORE2 = fish-eye",
-}
+#: Value of the line Model, by the name of the class; and of a CAHVORE camera, by its linearity.
+_MODELS = {"CAHV": "CAHV = perspective, linear", "CAHVOR": "CAHVOR = perspective, distortion"}
+_CAHVORE_MODELS = {1.0: "CAHVORE1 = perspective, distortion, pupil", 0.0: "CAHVORE2 = fish-eye"}
 _ASSIGNMENT = re.compile(r"\s*(?P<name>[A-Za-z][A-Za-z_ ]*?)\s*=\s*(?P<value>.*?)\s*$")
 _MODEL = re.compile(r"(?P<name>CAHV|CAHVOR|CAHVORE(?P<type>\d+)?)(?:\s*,\s*(?P<parameter>[^\s=]+))?\s*(?:=.*)?$")
 
@@ -115,11 +111,12 @@ def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, fr
     `comment` and `frame` (a description of the frame of reference) are written as lines that begin with '#'.
     """
     if isinstance(camera, Cahvore):
-        model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
+        model = _CAHVORE_MODELS.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
     else:
-        model = _TYPE_NAMES[type(camera).__name__.upper()]
+        model = _MODELS[type(camera).__name__.upper()]
     (hs, vs), (hc, vc), theta = camera.focal_lengths, camera.image_centre, camera.theta
-    lines = [f"# {line}".rstrip() for line in (*comment.splitlines(), *([f"Frame: {frame}"] if frame else []))]
+    remarks = [*comment.splitlines(), *(f"Frame: {frame}".splitlines() if frame else [])]
+    lines = [f"# {line}".rstrip() for line in remarks]
     lines += [f"Model = {model}", "", f"Dimensions = {camera.size[0]} {camera.size[1]}", ""]
     for letter in type(camera).__name__.upper():
         lines.append(f"{letter} = " + " ".join(repr(float(number)) for number in getattr(camera, letter.lower())))

@@ -1,4 +1,4 @@
-"""The camera models CAHV (pinhole) and CAHVOR (radial distortion).
+"""The camera models CAHV (pinhole) and CAHVOR (radial distortion), and the base class of CAHVOR and CAHVORE.
 
 CAHV: Yakimovsky & Cunningham 1978. CAHVOR: Gennery 2001; 2006, section 2.
 """

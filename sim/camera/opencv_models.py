@@ -85,21 +85,24 @@ def from_opencv(
     directions = _rotate_to_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
 
+    # numbers of tilts (rad), radial terms, rotations (rad), relative scales and shifts (pixels) in a change
+    counts = (2, 2, 3, 2, 2)
+
     def modify_camera(change: Array) -> Cahvor:
         """Tilt O, change rho1 and rho2, rotate the image plane, scale and shift H and V."""
-        rotation = Rotation.from_rotvec(change[4:7]).as_matrix()
-        scale_u, scale_v, shift_u, shift_v = change[7:]
-        o = start.o + change[0] * tilt_axes[0] + change[1] * tilt_axes[1]
+        tilt, radial, turn, (scale_u, scale_v), (shift_u, shift_v) = np.split(change, np.cumsum(counts)[:-1])
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        o = start.o + tilt[0] * tilt_axes[0] + tilt[1] * tilt_axes[1]
         return replace(
             start,
             a=rotation @ start.a,
             h=rotation @ (start.h * (1 + scale_u) + shift_u * start.a),
             v=rotation @ (start.v * (1 + scale_v) + shift_v * start.a),
             o=o / np.linalg.norm(o),
-            r=start.r + np.array([0.0, *change[2:4]]),
+            r=start.r + np.array([0.0, *radial]),
         )
 
-    scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
+    scales = np.repeat([1e-3, 1e-2, 1e-3, 1e-3, 1.0], counts)
     return _fit_camera(start, modify_camera, (directions, pixels), scales, method="lm")
 
 

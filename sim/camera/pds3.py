@@ -120,8 +120,8 @@ def _create_camera(group: Any, size: tuple[int, int], source: Source) -> CameraM
         raise source.error(id_field, _describe_fault(letters), "a list of letters such as (C,A,H,V,O,R)")
     if len(set(letters)) != len(letters):
         raise source.error(id_field, f"{letters} repeats a letter", "each letter once")
-    units = group.get("MODEL_COMPONENT_UNIT", ["N/A"] * len(letters))
-    for letter, unit in zip(letters, units, strict=False):
+    units = group.get("MODEL_COMPONENT_UNIT", "N/A")
+    for letter, unit in zip(letters, units if isinstance(units, list) else [units] * len(letters), strict=False):
         if letter in ("C", "E") and str(unit).upper() not in _PDS3_METRES:
             raise source.error(f"{_CAMERA_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
     vectors: dict[str, list[float]] = {}
@@ -161,7 +161,8 @@ class Pds3Product:
     - counts: the stored numbers of the pixels, DN
     - pose: frame of reference (a site's or the Mars-fixed frame) and the rover's pose in it, metres; None if not in the
       label
-    - time_s: spacecraft clock at the middle of the exposure; None if not in the label
+    - time_s: spacecraft clock at the middle of the exposure, or at its start or end if the label has only one of them;
+      None without both
     """
 
     counts: UInt16[np.ndarray, "rows columns"]

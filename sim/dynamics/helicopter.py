@@ -194,15 +194,15 @@ class HelicopterFlight(Trajectory):
         pitch, pitch_rate = self.tilt_along.derivatives(times_s)
         roll, roll_rate = self.tilt_across.derivatives(times_s)
         angle_rates = np.stack([self.platform.derivative()(times_s), pitch_rate, roll_rate], axis=-1)
-        vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
-        angles = np.stack([yaw, pitch, roll], axis=-1) + vibration[0][:, 3:]
-        attitudes, rates = attitudes_and_body_rates(angles, angle_rates + vibration[1][:, 3:])
+        shakes, (twist, twist_rate, _) = self.vibration.derivatives(times_s)
+        angles = np.stack([yaw, pitch, roll], axis=-1) + twist
+        attitudes, rates = attitudes_and_body_rates(angles, angle_rates + twist_rate)
         forward = np.array([np.sin(self.azimuth_rad), np.cos(self.azimuth_rad), 0.0])
         left = np.array([-forward[1], forward[0], 0.0])
         derivatives = []
         for order in range(3):
             along, across, up = (curve.derivative(order)(times_s) for curve in (self.along, self.across, self.up))
-            derivatives.append(np.outer(along, forward) + np.outer(across, left) + vibration[order][:, :3])
+            derivatives.append(np.outer(along, forward) + np.outer(across, left) + shakes[order])
             derivatives[order][:, 2] += up
         derivatives[0] = self.origin_m + derivatives[0]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)

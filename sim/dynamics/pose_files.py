@@ -32,6 +32,10 @@ from marsyard.sim.files import check_regular, report_damage
 
 #: Columns of a table: time, position, and quaternion with the scalar part last.
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+#: Positions and quaternions in a row of these columns.
+_POSITION, _QUATERNION = slice(1, 4), slice(4, 8)
+#: Columns of position and quaternion in EuRoC's ground truth, whose quaternions have the scalar part first.
+_EUROC_POSE = [1, 2, 3, 5, 6, 7, 4]
 #: Column of integer times that replaces time_s, and powers of ten of its unit and of a second.
 NANOSECONDS = "time_ns"
 _EXPONENTS = {"time_s": 0, NANOSECONDS: -9}
@@ -135,9 +139,7 @@ def _read_table(path: str, head: bytes) -> tuple[Decimal, Float64[np.ndarray, "n
 
     if first_line.startswith("#timestamp") and "," in first_line:
         frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
-        return _join_times(
-            path, NANOSECONDS, frame[0].tolist(), frame.to_numpy(dtype=np.float64)[:, [1, 2, 3, 5, 6, 7, 4]]
-        )
+        return _join_times(path, NANOSECONDS, frame[0].tolist(), frame.to_numpy(dtype=np.float64)[:, _EUROC_POSE])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored
         if "," in first_line and not first_line.startswith("#"):
@@ -276,7 +278,7 @@ def _check_resolution(
         return
     steps = np.diff(values, axis=0)
     step_s = float(np.median(steps[:, 0]))
-    speed_m_s = float(np.median(np.linalg.norm(steps[:, 1:4], axis=1))) / step_s if step_s > 0.0 else 0.0
+    speed_m_s = float(np.median(np.linalg.norm(steps[:, _POSITION], axis=1))) / step_s if step_s > 0.0 else 0.0
     resolution_s = resolution * 10.0**exponent
     noise_m_s2 = np.sqrt(0.5) * resolution_s * speed_m_s / step_s**2 if step_s > 0.0 else 0.0
     if noise_m_s2 > MAX_ROUNDING_M_S2:
@@ -314,7 +316,7 @@ def _check_poses(path: str, digest: str, start: Decimal, values: Float64[np.ndar
         raise TrajectoryFileError(
             f"{path}: pose {first + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
         )
-    lengths = np.linalg.norm(values[:, 4:], axis=1)
+    lengths = np.linalg.norm(values[:, _QUATERNION], axis=1)
     not_unit = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
     if not_unit.size:
         raise TrajectoryFileError(
@@ -322,5 +324,5 @@ def _check_poses(path: str, digest: str, start: Decimal, values: Float64[np.ndar
             f"allowed: 1 within {UNIT_TOLERANCE:g}"
         )
     # copies, because the table can be read-only, and SciPy's rotations do not accept read-only arrays
-    times, positions = np.array(values[:, 0]), np.array(values[:, 1:4])
-    return RecordedPoses(path, digest, start, times, positions, values[:, 4:] / lengths[:, None])
+    times, positions = np.array(values[:, 0]), np.array(values[:, _POSITION])
+    return RecordedPoses(path, digest, start, times, positions, values[:, _QUATERNION] / lengths[:, None])

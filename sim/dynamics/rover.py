@@ -3,7 +3,13 @@
 Each side of the rover has a rocker and a bogie. The front wheel and the pivot of the bogie are mounted on the rocker,
 the middle and the rear wheel on the bogie. Rockers and bogies rotate about axes parallel to the body's y axis. A
 differential rotates the two rockers against the body by opposite angles: the body's pitch is the mean of their
-pitches. Wheels are unsteered cylinders with axles parallel to the y axis. There are no springs or joint limits.
+pitches. One side, with the front to the right::
+
+      bogie pivot ----- rocker pivot (on the body)
+       |       |              |
+     rear    middle         front
+
+Wheels are unsteered cylinders with axles parallel to the y axis. There are no springs or joint limits.
 
 For a position (east, north) and an azimuth there are six unknowns: height, pitch and roll of the body, and the angles
 of the differential and of both bogies. The six equations are that the gap between each wheel and the ground is zero.
@@ -196,9 +202,9 @@ def settle(
         height = float(initial.world_from_rover.translation[2])
         start = np.array([height, initial.pitch_rad, initial.roll_rad, initial.differential_rad, *initial.bogies_rad])
     unknowns, gaps = equations.solve(start)
-    differential, left, right = (float(angle) for angle in unknowns[3:])
-    rotation = Rotation.from_euler("ZYX", [equations.yaw_rad, -unknowns[1], unknowns[2]])
-    return Stance(rigid(rotation, np.array([east_m, north_m, unknowns[0]])), differential, (left, right), gaps)
+    height, pitch, roll, differential, left, right = unknowns.tolist()
+    rotation = Rotation.from_euler("ZYX", [equations.yaw_rad, -pitch, roll])
+    return Stance(rigid(rotation, np.array([east_m, north_m, height])), differential, (left, right), gaps)
 
 
 def compute_wheel_centres(
@@ -238,7 +244,11 @@ def _rotate_about_pivot(
 
 @dataclass(frozen=True)
 class _StanceEquations:
-    """Gaps under the wheels as a function of (height, pitch, roll, differential, left bogie, right bogie)."""
+    """Gaps under the wheels as a function of the unknowns.
+
+    They are height, pitch (positive: nose up) and roll of the body, and the angles of the differential, the left and
+    the right bogie.
+    """
 
     rover: RoverParameters
     ground: DrivenGround
@@ -274,7 +284,8 @@ class _StanceEquations:
         """Compute the derivatives of the gaps by finite differences, at the lowest point of each tread only."""
         step = _DIFFERENCE_STEP * np.eye(6)
         heights = self._compute_heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
-        return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE_STEP)).T)
+        before, after = np.split(heights, 2)
+        return np.asarray(((after - before) / (2.0 * _DIFFERENCE_STEP)).T)
 
     def _find_lowest_points(self, unknowns: Vector6) -> tuple[Vector6, WheelPoints]:
         """Find each tread's smallest height above the ground, and the point there, relative to the wheel's centre."""
@@ -299,12 +310,13 @@ class _StanceEquations:
 
         `treads` are points relative to the wheels' centres, for each wheel or once if common to all wheels.
         """
-        a, b, c = np.moveaxis(_rotate_wheels(*self._geometry, unknowns[:, 3:])[:, :, None] + treads, -1, 0)
+        body_height, angles, joints = np.split(unknowns, [1, 3], axis=1)
+        a, b, c = np.moveaxis(_rotate_wheels(*self._geometry, joints)[:, :, None] + treads, -1, 0)
         # rotation by roll about x, then by -pitch about y, then by yaw about z
-        (sp, sr), (cp, cr) = (function(unknowns.T[1:3, :, None, None]) for function in (np.sin, np.cos))
+        (sp, sr), (cp, cr) = (function(angles.T[:, :, None, None]) for function in (np.sin, np.cos))
         sy, cy = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
         up = sr * b + cr * c
         forward, left = cp * a - sp * up, cr * b - sr * c
         x = self.position_m[0] + cy * forward - sy * left
         y = self.position_m[1] + sy * forward + cy * left
-        return np.asarray(unknowns[:, 0, None, None] + cp * up + sp * a - self.ground.height(x, y))
+        return np.asarray(body_height[:, :, None] + cp * up + sp * a - self.ground.height(x, y))

@@ -22,6 +22,15 @@ from marsyard.sim.terrain.surface import ALIGNMENT_BYTES
 
 #: A Dr.Jit array of one of the types of the device.
 Values = Any
+#: NumPy's types of the elements of these arrays.
+_NUMPY_TYPES: dict[Any, Any] = {
+    Bool: np.bool_,
+    UInt8: np.uint8,
+    Int32: np.int32,
+    UInt32: np.uint32,
+    Float: np.float32,
+    Float64: np.float64,
+}
 
 
 def compiled(function: Callable[..., Values]) -> Any:
@@ -81,16 +90,6 @@ def to_device(kind: Any, values: NDArray[Any] | float, *, share: bool = False) -
     return copy
 
 
-_NUMPY_TYPES: dict[Any, Any] = {
-    Bool: np.bool_,
-    UInt8: np.uint8,
-    Int32: np.int32,
-    UInt32: np.uint32,
-    Float: np.float32,
-    Float64: np.float64,
-}
-
-
 def vectors_to_device(kind: Any, vectors: NDArray[Any]) -> Values:
     """Copy vectors, shape (n, 3), to an array of vectors."""
     return kind(*(to_device(dr.value_t(kind), vectors[:, axis]) for axis in range(vectors.shape[1])))
@@ -105,7 +104,10 @@ def to_host(values: Values) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class PeriodicGrid:
-    """A periodic grid of numbers, whose side is a power of two; y increases with the row."""
+    """A periodic grid of numbers, row by row, whose side is a power of two; y increases with the row.
+
+    - per_metre: cells per metre; the first number is at x = y = 0
+    """
 
     values: Values
     log2_side: Values

@@ -130,11 +130,15 @@ class CloudLayer:
         return self.parameters.size_m * PERIOD_SIZES / CELLS
 
     def at_time(self, sun: Sun, time_s: float) -> Clouds:
-        """Return the clouds at their positions at a time."""
+        """Return the clouds at their positions at a time, for a sun above the horizon."""
         p = self.parameters
-        numbers = (self.height_m, p.wind_east_m_s * time_s, p.wind_north_m_s * time_s, p.direct_transmittance(sun))
-        height, east, north, transmittance = map(Float64, numbers)
-        return Clouds(self._cover_grid, height, east, north, 1.0 - transmittance)
+        return Clouds(
+            cover=self._cover_grid,
+            height=Float64(self.height_m),
+            east=Float64(p.wind_east_m_s * time_s),
+            north=Float64(p.wind_north_m_s * time_s),
+            opacity=1.0 - Float64(p.direct_transmittance(sun)),
+        )
 
     @cached_property
     def _cover_grid(self) -> PeriodicGrid:
@@ -145,6 +149,7 @@ class CloudLayer:
     ) -> FloatArray[np.ndarray, "*batch"]:
         """Fraction of direct sunlight that reaches world points (metres) through the layer; NaN for NaN points.
 
+        The sun must be above the horizon.
         Ground truth of an image: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
         """
         p, direction = self.parameters, np.asarray(sun.direction, dtype=np.float64)

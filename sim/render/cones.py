@@ -1,8 +1,9 @@
-"""Cones that contain the rays of an image, and the bodies and the ground that are visible in them."""
+"""Cones that contain the rays of an image, and the bodies and the ground that they contain."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool as BoolArray
@@ -12,11 +13,20 @@ from jaxtyping import Float64 as FloatArray
 Cone = tuple[FloatArray[np.ndarray, "3"], FloatArray[np.ndarray, "3"], float]
 #: Centre and radius of a bounding sphere of each body, metres.
 Spheres = FloatArray[np.ndarray, "bodies 4"]
-#: Minimum and maximum x, then y, metres.
-Bounds = tuple[float, float, float, float]
 #: Number of directions along the rim of a cone whose convex hull bounds the ground in the cone, and the fraction by
 #: which the hull is enlarged.
 _RIM_DIRECTIONS, _MARGIN = 64, 0.01
+#: Minimum downward component of all directions in a cone; above it the ground in the cone is treated as unbounded.
+_MIN_DESCENT = 1e-6
+
+
+class Bounds(NamedTuple):
+    """Minimum and maximum x, then y, metres."""
+
+    west: float
+    east: float
+    south: float
+    north: float
 
 
 def spheres_in_cone(
@@ -55,7 +65,7 @@ def ground_in_cones(cones: Sequence[Cone], min_height_m: float) -> Bounds | None
         second_axis = np.cross(axis, first_axis)
         perpendicular = np.cos(azimuths)[:, None] * first_axis + np.sin(azimuths)[:, None] * second_axis
         rim = np.cos(half_angle_rad) * axis + np.sin(half_angle_rad) * perpendicular
-        if half_angle_rad >= 0.5 * np.pi or np.any(rim[:, 2] >= -1e-6):
+        if half_angle_rad >= 0.5 * np.pi or np.any(rim[:, 2] >= -_MIN_DESCENT):
             return None
         ends = apex + ((min_height_m - apex[2]) / rim[:, 2])[:, None] * rim
         points.append(np.vstack([apex, ends])[:, :2])
@@ -63,4 +73,4 @@ def ground_in_cones(cones: Sequence[Cone], min_height_m: float) -> Bounds | None
     low, high = hull.min(axis=0), hull.max(axis=0)
     margin = _MARGIN * (high - low)
     (west, south), (east, north) = low - margin, high + margin
-    return float(west), float(east), float(south), float(north)
+    return Bounds(float(west), float(east), float(south), float(north))

@@ -34,6 +34,7 @@ Float, Float64 = _types.Float, _types.Float64
 Array2f, Array3f, Array4f = _types.Array2f, _types.Array3f, _types.Array4f
 Array2f64, Array3f64, Matrix3f64 = _types.Array2f64, _types.Array3f64, _types.Matrix3f64
 
+# importing this module sets Dr.Jit's threads to those of numba, which workers limit to one
 dr.set_thread_count(int(os.environ.get("NUMBA_NUM_THREADS") or os.cpu_count() or 1))
 
 

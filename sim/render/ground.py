@@ -21,6 +21,12 @@ MAX_NEWTON_RATE = -1e-3
 #: Minimum step of the search along a ray, relative to the distance: a quarter of a navcam pixel's footprint at 10 deg,
 #: because even low crests hide the ground behind them.
 MIN_STEP_FRACTION = 0.00125
+#: Limits of the search for a grazing ray, relative to the guess; and samples that are added to the far limit.
+GRAZING_START, GRAZING_END, GRAZING_MARGIN_SAMPLES = 0.8, 1.25, 4.0
+#: Step of the search without height bounds, divided by the clearance of the ray (assumed).
+CLEARANCE_STEP = 1.5
+#: Logarithm to the base 2 of the samples along the side of a block of the height bounds.
+_LOG2_BLOCK = CEILING_BLOCK.bit_length() - 1
 #: Iterations of the search for a crest. Of 51,485 grazing rays in rover images, 4 rays miss a crest with four
 #: iterations, and 25 rays with one iteration or without this search (ADR 6).
 CREST_ITERATIONS = 4
@@ -95,7 +101,7 @@ def skip_empty_blocks(
     The blocks of `Surface.ceilings` are traversed in order (Amanatides & Woo 1987).
     """
     block = terrain.spacing_at(level) * float(CEILING_BLOCK)
-    log2_side = dr.gather(UInt32, terrain.log2_side, UInt32(level), active) - 2
+    log2_side = dr.gather(UInt32, terrain.log2_side, UInt32(level), active) - _LOG2_BLOCK
     first, last = dr.gather(UInt32, terrain.first_ceiling, UInt32(level), active), Int32((UInt32(1) << log2_side) - 1)
     x, y, _ = (ray.origin + start * ray.direction) / block
     rate_x, rate_y, _ = ray.direction / block
@@ -231,7 +237,7 @@ def first_crossing(
         step = larger(spacing, MIN_STEP_FRACTION * t)
         has_skipped = Bool(False)
         if terrain.ceilings is None:
-            step = larger(step, 1.5 * new.height)
+            step = larger(step, CLEARANCE_STEP * new.height)
         else:
             may_skip = is_active & (new.height > spacing)
             skip_end = skip_empty_blocks(terrain, level, ray, t, farthest, may_skip)
@@ -253,10 +259,8 @@ def first_crossing(
 def search_grazing_ray(
     terrain: Terrain, level: Values, extent: Extent, ray: Ray, guess: Values, active: Values
 ) -> Values:
-    """Distance of a grazing ray's first intersection with the ground near a guess; infinite if there is none.
-
-    The search covers 0.8 to 1.25 times the guess.
-    """
-    start = larger(0.8 * guess, extent.entry_distance(ray))
-    farthest = smaller(1.25 * guess + 4.0 * terrain.spacing_at(level), extent.exit_distance(ray))
+    """Distance of a grazing ray's first intersection with the ground near a guess; infinite if there is none."""
+    start = larger(GRAZING_START * guess, extent.entry_distance(ray))
+    margin = GRAZING_MARGIN_SAMPLES * terrain.spacing_at(level)
+    farthest = smaller(GRAZING_END * guess + margin, extent.exit_distance(ray))
     return first_crossing(terrain, level, ray, start, farthest, active)

@@ -10,6 +10,8 @@ from marsyard.sim.terrain.kernels import Array, Level, sample
 
 Array32 = NDArray[np.float32]
 Longs = NDArray[np.int64]
+#: Height below all ground, metres: shadow height before the sweep has met ground.
+_BELOW_GROUND_M = -1e9
 #: Unit of the stored distances of shadow casters, in rows of the grid.
 CASTER_UNIT_ROWS = 4
 
@@ -30,7 +32,8 @@ def sweep_shadow(
     sun, minus `drop` metres and shifted by `-shift` columns. `row_sign` is 1.0 if the row number increases towards the
     sun, else -1.0. `max_rows` is the length of the longest shadow in rows; the sweep starts at this distance.
 
-    Outputs are `shadow`, the shadow height, and `caster_distance` in units of `CASTER_UNIT_ROWS` rows, rounded up.
+    Outputs are `shadow`, the shadow height, and `caster_distance` in units of `CASTER_UNIT_ROWS` rows, rounded up, at
+    most 255.
     """
     rows, columns = height.shape
     row_mask, column_mask = rows - 1, columns - 1
@@ -38,7 +41,7 @@ def sweep_shadow(
     fraction = np.float32(shift - whole_columns)
     weight = np.float32(1.0) - fraction
     row_drop = np.float32(drop)
-    shadow_row = np.full(columns, np.float32(-1e9), dtype=np.float32)
+    shadow_row = np.full(columns, np.float32(_BELOW_GROUND_M), dtype=np.float32)
     caster = np.empty(columns, dtype=np.float32)
     shadow_rows = np.zeros(columns, dtype=np.int32)
     caster_rows = np.empty(columns, dtype=np.int32)

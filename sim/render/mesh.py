@@ -34,6 +34,7 @@ def graded_offsets(half_width_m: float, finest_m: float, count: int) -> Lines:
     if finest_m * last >= half_width_m:
         raise ValueError(f"{count} offsets with a spacing of {finest_m:g} m exceed {half_width_m:g} m")
     log_ratio = np.log(half_width_m / finest_m)
+    # from almost constant spacing to the largest hyperbolic sine that does not overflow
     b = brentq(lambda x: np.log(np.sinh(x * last) / np.sinh(x)) - log_ratio, 1e-6 / last, 500.0 / last, xtol=1e-15)
     return np.asarray(finest_m / np.sinh(b) * np.sinh(b * steps))
 

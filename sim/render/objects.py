@@ -16,7 +16,7 @@ from marsyard.sim.render.triangles import Hierarchy, morton_codes
 
 #: Identifiers of users' meshes start here; identifiers of rocks are smaller.
 FIRST_MESH_NUMBER = 2**30
-#: Triangle numbers are rendered as 24-bit colours; 0 is the ground.
+#: Maximum number of triangles of all bodies. A view draws fewer: it numbers the corners with 24 bits (`pinhole`).
 MAX_TRIANGLES = 2**24 - 2
 
 
@@ -29,7 +29,7 @@ class Objects:
     - first_triangle: first triangle of each body, and the number of triangles at the end
     - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field; a
       user's mesh has a number from 2^30; the rover has a negative number
-    - shelter: corners of a convex body that hides the sky from the ground below it (`skylight.Shelter`), or None
+    - shelter: corners of a convex body that hides the sky from the ground below it (`obstructions.Shelter`), or None
     - unseen_mounds: mounds (see `mounds`) of bodies without triangles: they only hide the sky
     """
 

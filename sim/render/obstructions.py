@@ -26,7 +26,8 @@ SHELTER_RANGE = 4.0
 _PARTS = float(2**22)
 #: Average number of mounds in a cell of their grid, and maximum number of cells along a side.
 _MOUNDS_PER_CELL, _MAX_CELLS = 1.0, 512
-#: Faces of a shelter, counter-clockwise seen from outside: bottom, top, and the sides i from corner i to corner i + 1.
+#: Faces of a shelter, three corners of each, counter-clockwise seen from outside: bottom with the corners 0 to 3, top
+#: with the corner i + 4 above corner i, and the sides i from corner i to corner i + 1.
 _FACES = ((0, 3, 2), (4, 5, 6), (0, 1, 5), (1, 2, 6), (2, 3, 7), (3, 0, 4))
 _BOTTOM, _TOP, _FIRST_SIDE = 0, 1, 2
 
@@ -106,7 +107,7 @@ class Mounds:
             return k + 1, east, north, up, aureole, is_active & (k + 1 < end)
 
         state = (UInt32(first), Int32(0), Int32(0), Int32(0), Int32(0), active & (first < end))
-        parts = dr.while_loop(state, lambda k, east, north, up, aureole, is_active: is_active, add_mound)[1:5]
+        _, *parts, _ = dr.while_loop(state, lambda k, east, north, up, aureole, is_active: is_active, add_mound)
         east, north, up, aureole = (Float(part) / _PARTS for part in parts)
         return Hidden(Array3f(east, north, up), smaller(aureole, 1.0))
 

@@ -40,6 +40,12 @@ SIDE_LOSS = 0.25
 #: Natural logarithm of the density of pebbles where the logarithm of the albedo is one standard deviation below its
 #: mean, relative to that at the mean, and maximum of the density relative to its mean (assumed).
 PATCHINESS, MAX_DENSITY = 1.2, 8.0
+#: Width of a uniform distribution divided by its standard deviation: the square root of 12.
+_UNIFORM_WIDTH = 3.464
+#: Minimum of the squared height of a half spheroid, divided by that of its top, for its normal: edges are not vertical.
+_MIN_UPWARDS = 0.04
+#: Numbers that are added to a cell's hash for its second and third hash.
+_SECOND_HASH, _THIRD_HASH = 0x9E3779B1, 0x7F4A7C15
 #: Angle between the grids of successive octaves, radians: no two of ten octaves are nearly parallel.
 _TURN = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -141,7 +147,7 @@ def _evaluate_cell(
     - offset: position relative to the cell's corner, metres
     """
     first = hash_cell(cell, octave)
-    second, third = mix_bits(first + UInt32(0x9E3779B1)), mix_bits(first + UInt32(0x7F4A7C15))
+    second, third = (mix_bits(first + UInt32(added)) for added in (_SECOND_HASH, _THIRD_HASH))
     # the pebble's rank among those of its octave, by diameter: where the density changes, pebbles grow or shrink
     rank = (Float(first >> 8) + 0.5) * 2.0**-24 / probability
     size = diameter * dr.power(1.0 + rank * pebbles.ratio, pebbles.root)
@@ -162,13 +168,13 @@ def _evaluate_cell(
     covered = visible * clip((1.0 - dr.sqrt(larger(outline, 0.0))) / edge + 0.5, 0.0, 1.0)
     # half spheroid, tilted: its normal is in proportion to (x / r, y / r, z / h**2)
     height = 2.0 * pebbles.height_ratio * (1.0 - _HEIGHT_SPREAD + 2.0 * _HEIGHT_SPREAD * _uniform(third, 8))
-    upwards = dr.sqrt(larger(1.0 - outline, 0.04))
+    upwards = dr.sqrt(larger(1.0 - outline, _MIN_UPWARDS))
     tilt_x, tilt_y = (2.0 * _uniform(bits, shift) - 1.0 for bits, shift in ((first, 0), (third, 16)))
     # mean over the covered part of the footprint (fitted, see the test)
     slope = height / (1.0 + 0.25 * edge * edge)
     normal_x, normal_y = ((component + _TILT * tilt) * slope for component, tilt in ((x, tilt_x), (y, tilt_y)))
     normal = dr.normalize(Array3f(*_rotate(normal_x, normal_y, axis_x, -axis_y), upwards))
-    log_albedo = pebbles.log_albedo + pebbles.log_albedo_sd * 3.464 * (_uniform(third, 0) - 0.5)
+    log_albedo = pebbles.log_albedo + pebbles.log_albedo_sd * _UNIFORM_WIDTH * (_uniform(third, 0) - 0.5)
     # nearest distance of the ray to the sun from the axis of the spheroid, in units in which it is a sphere
     sun_x, sun_y = _rotate(sun.x, sun.y, axis_x, axis_y)
     horizontal = dr.sqrt(sun_x * sun_x + sun_y * sun_y)

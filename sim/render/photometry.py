@@ -99,9 +99,14 @@ class Photometry:
             sky_light = SkyLight.of(self.sky_fraction, 1.0, 0.0, sun.direction)
         else:
             sky_light = self.sky.light(sun, self.sky_fraction)
-        law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation(), ground_light)
-        lunar_fraction, amplitude, width, normalisation, from_ground = map(Float, law)
-        return Law(lunar_fraction, amplitude, width, normalisation, from_ground, sky_light)
+        return Law(
+            lunar_fraction=Float(self.lunar_fraction),
+            surge_amplitude=Float(self.surge_amplitude),
+            surge_width=Float(self.surge_width),
+            normalisation=Float(self.normalisation()),
+            ground_light=Float(ground_light),
+            sky_light=sky_light,
+        )
 
     def disc_fraction(self, sun: Sun) -> float:
         """Fraction of direct sunlight that comes from the sun's disc; 1 under a uniform sky, which has no aureole."""

@@ -39,6 +39,7 @@ class DepthRenderer:
         self._offscreen._renderer = _VertexRenderer(side_px, side_px)
         self._camera = pyrender.IntrinsicsCamera(1.0, 1.0, 0.5 * side_px, 0.5 * side_px)
         self._scene, self._mesh_node = pyrender.Scene(), None
+        self._numbers = np.empty(0, dtype=np.int64)
         self._camera_node = self._scene.add(self._camera)
 
     def load(

@@ -56,7 +56,7 @@ class PixelRays:
     view_of_pixel: UInt8[np.ndarray, "pixels"]
 
     @cached_property
-    def device(self) -> Rays:
+    def device_rays(self) -> Rays:
         """The rays on the device."""
         origins = vectors_to_device(Array3f, self.origins) if self.origin_radius_m > 0.0 else None
         return Rays(vectors_to_device(Array3f, self.directions), origins, to_device(Float, self.pixel_angles))

@@ -29,6 +29,8 @@ MIN_INCIDENCE_SINE = 0.01
 MAX_FINE_FOOTPRINT = 8.0
 #: Sine of the angle between ray and horizontal below which the ray may hit crests that the mesh does not resolve.
 MAX_GRAZING_SINE = 0.4
+#: Maximum ratio of the depths of four neighbouring samples between which the ground is continuous.
+MAX_DEPTH_RATIO = 1.1
 #: Tolerance of barycentric weights, so that no ray passes between two neighbouring triangles.
 SLACK = 1e-9
 
@@ -73,8 +75,8 @@ class Hits:
 
     - distance: along the ray, metres; infinite for the sky
     - triangle, second, third: number of the object's triangle (-1: none), and weights of its second and third corner
-    - level: terrain level of the intersection with the ground; -1 if the search failed and the distance is that of the
-      mesh that OpenGL draws
+    - level: terrain level of the intersection with the ground; -1 instead of 0 if the search on that level failed and
+      the distance is that of the mesh that OpenGL draws
     """
 
     distance: Values
@@ -129,7 +131,7 @@ def _guess(views: Views, rays: Rays, ray: Ray) -> _Guess:
     interpolated = 1.0 / dr.fma(fraction_v, below - above, above)
     smallest = smaller(smaller(depths[0], depths[1]), smaller(depths[2], depths[3]))
     largest = larger(larger(depths[0], depths[1]), larger(depths[2], depths[3]))
-    is_continuous = (smallest > 0.0) & (largest < 1.1 * smallest)
+    is_continuous = (smallest > 0.0) & (largest < MAX_DEPTH_RATIO * smallest)
     shows_triangle = Bool(False) if numbers is None else (numbers[0] | numbers[1] | numbers[2] | numbers[3]) != 0
     nearest, min_offset = Float(0.0), Float(dr.inf)
     for k, (i, j) in enumerate(product((0, 1), repeat=2)):

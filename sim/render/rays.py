@@ -13,7 +13,7 @@ from marsyard.sim.render.device import Array3f, Array3f64, Float, Float64, Int32
 
 @dataclass(eq=False)
 class Ray:
-    """Rays in world axes: origins, metres, and unit directions."""
+    """Rays in world axes: origins, metres (also relative to a point near them), and unit directions."""
 
     origin: Values
     direction: Values

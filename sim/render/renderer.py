@@ -54,6 +54,8 @@ _TRIM_THRESHOLD_BYTES = 1 << 30
 _TRIM_INTERVAL_SCENES = 16
 #: Number of rays along each side of an image (probe rays) that determine the visible ground.
 _PROBES = 9
+#: Depth of the near clipping plane divided by the height of the camera above the ground.
+_NEAR_FRACTION = 0.05
 #: Index of rows and columns of an image.
 PixelIndex = tuple[slice | Int64[np.ndarray, "n"], slice | Int64[np.ndarray, "n"]]
 
@@ -120,6 +122,7 @@ class Renderer:
         numbers = scene.objects.in_cone(
             position, rotation @ rays.axis, half_angle_rad, apex_radius_m=rays.origin_radius_m
         )
+        self._free_memory_of_last_scene(scene)
         views = self._draw_views(scene, rays, rotation, position, clearance, numbers)
         highest_ray = np.arcsin(np.clip((rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
@@ -127,8 +130,8 @@ class Renderer:
         terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
         tree, light = scene.objects.hierarchy(numbers, position), scene.light(time_s)
         pose, extent = Pose.of(rotation, position), scene.extent
-        hits = trace_primary_rays(terrain, extent, views, pose, rays.device, tree, is_grazing)
-        image = shade_hits(scene, light, terrain, pose, rays.device, hits)
+        hits = trace_primary_rays(terrain, extent, views, pose, rays.device_rays, tree, is_grazing)
+        image = shade_hits(scene, light, terrain, pose, rays.device_rays, hits)
         radiance, body, range_m = to_host(image.radiance), to_host(image.body), to_host(hits.distance)
         columns, rows = rays.size
         size, side = (UInt32(columns), UInt32(rows)), scene.edge_rays
@@ -141,6 +144,17 @@ class Renderer:
             radiance[edge_pixels] = subpixels.reshape(len(edge_pixels), -1).mean(axis=1)
         radiance, body, range_m = (layer.reshape(rows, columns) for layer in (radiance, body, range_m))
         return Frame(radiance, range_m, body, to_host(image.normal).reshape(rows, columns, 3), world_from_body, rays)
+
+    def _free_memory_of_last_scene(self, scene: Scene) -> None:
+        """Free the memory that Dr.Jit keeps for further images: now if the scene is new, and when it is deleted."""
+        if self._last_scene is not None and self._last_scene() is scene:
+            return
+        # the next terrain is built without this memory
+        self._last_scene = ref(scene, lambda _: dr.flush_malloc_cache())
+        self._scene_count += 1
+        dr.flush_malloc_cache()
+        if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
+            return_freed_memory()
 
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
@@ -160,13 +174,6 @@ class Renderer:
 
         `rotation` and `position` are the camera's pose, `clearance_m` is the height of the camera above the ground.
         """
-        if self._last_scene is None or self._last_scene() is not scene:
-            # the next terrain is built without the memory that Dr.Jit keeps for further images
-            self._last_scene = ref(scene, lambda _: dr.flush_malloc_cache())
-            self._scene_count += 1
-            dr.flush_malloc_cache()
-            if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
-                return_freed_memory()
         columns, rows = rays.size
         probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
         directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
@@ -178,10 +185,10 @@ class Renderer:
             world_from_view = np.eye(4)
             world_from_view[:3, :3] = rotation @ view_from_body.T
             world_from_view[:3, 3] = position
-            # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
-            # guess, so its low resolution at large distances has no effect on the image
-            far = 2.0 * scene.mesh_half_width_m + clearance_m
-            images.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
+            # nearer surfaces are clipped; the depth is only a first guess, so its low resolution at large distances has
+            # no effect on the image
+            near, far = _NEAR_FRACTION * clearance_m, 2.0 * scene.mesh_half_width_m + clearance_m
+            images.append(renderer.draw(world_from_view, float(focal), near, far))
         # a single view is not copied
         depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*images, strict=True))
         return Views.of(depth, ids, rays)
@@ -199,7 +206,7 @@ def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side:
     columns, rows = rays.size
     pixel = to_device(UInt32, np.repeat(pixels, side**2))
     ray_in_pixel = to_device(UInt32, np.tile(np.arange(side**2), len(pixels)))
-    return pixel, split_rays(rays.device, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
+    return pixel, split_rays(rays.device_rays, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
 
 
 def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:

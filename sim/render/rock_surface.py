@@ -15,6 +15,7 @@ from marsyard.sim.render.arrays import Values, clip, larger
 from marsyard.sim.render.device import Array3f, Array3f64, Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_space
 from marsyard.sim.render.texture import MIN_SLOPE_CELLS, SLOPE_FADING, fade_octave
+from marsyard.sim.terrain.sites import ROCK_TEXTURE_M
 
 #: Cells of the coarsest octave of the grain and of the albedo texture as fractions of a rock's size, and number of
 #: octaves of the grain; slope of each octave of the grain, for a noise of one unit per cell (assumed).
@@ -31,6 +32,12 @@ MARGIN_CELL, MARGIN = 0.25, 0.5
 #: and from which it is bare: a thin, cohesive film stays on steep faces (the first assumed, the second fitted to the
 #: darkest parts of mast images).
 MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(115.0)
+#: Finer fractures: cells and depth as fractions of those of the network (assumed).
+_FINE_FRACTURE = 0.3
+#: Seeds of the noise of fractures, finer fractures and dust margin; those of the grain are the numbers of its octaves.
+_FRACTURE_SEED, _FINE_FRACTURE_SEED, _MARGIN_SEED = 7, 8, 11
+#: Step of the finite differences of the grain, in cells; minimum size of a rock, metres.
+_STEP_CELLS, _MIN_SIZE_M = 0.1, 1e-3
 #: Texture of other objects, such as rovers, as a fraction of that of rocks: slight wear (assumed).
 WEAR = 0.15
 
@@ -71,8 +78,11 @@ def dust_cover(normal_z: Values) -> Values:
 
 
 def texture_frame(grain: Values, position: Values, footprint: Values) -> tuple[Values, Values]:
-    """Positions and footprints for the albedo texture, scaled to the size of the rock and stretched along its beds."""
-    scale = 0.2 / (TEXTURE_CELL * larger(grain.w, 1e-3))
+    """Positions and footprints for the albedo texture, scaled to the size of the rock and stretched along its beds.
+
+    `grain` is that of `describe_grain`, with the size as w.
+    """
+    scale = ROCK_TEXTURE_M / (TEXTURE_CELL * larger(grain.w, _MIN_SIZE_M))
     return _stretch(grain, position) * Float64(scale), footprint * scale
 
 
@@ -83,18 +93,18 @@ def _stretch(grain: Values, vector: Values) -> Values:
 
 
 def rock_surface(grain: Values, position: Values, normal: Values, footprint: Values) -> RockSurface:
-    """Compute the surface of rocks at positions with these normals and footprints."""
-    size = larger(grain.w, 1e-3)
+    """Compute the surface of rocks at positions with these normals and footprints; `grain`: see `texture_frame`."""
+    size = larger(grain.w, _MIN_SIZE_M)
     stretched = _stretch(grain, position)
     first_cell = Float64(GRAIN_CELL * size)
     min_cell = Float64(MIN_SLOPE_CELLS * footprint)
 
     def add_octave(octave: Values, cell: Values, total: Values) -> tuple[Values, Values, Values]:
         gain = GRAIN_SLOPE * fade_octave(footprint, cell, SLOPE_FADING)
-        step = 0.1
-        at = [stretched + Array3f64(*(step * (axis == k) for k in range(3))) * cell for axis in (-1, 0, 1, 2)]
-        here, *ahead = (noise_in_space(list(point), cell, octave) for point in at)
-        return octave + 1, 0.5 * cell, total + gain / step * Array3f(*(value - here for value in ahead))
+        # the position itself, and a step along each axis
+        steps = [(0.0, 0.0, 0.0), (_STEP_CELLS, 0.0, 0.0), (0.0, _STEP_CELLS, 0.0), (0.0, 0.0, _STEP_CELLS)]
+        here, *ahead = (noise_in_space(list(stretched + Array3f64(*step) * cell), cell, octave) for step in steps)
+        return octave + 1, 0.5 * cell, total + gain / _STEP_CELLS * Array3f(*(value - here for value in ahead))
 
     _, _, slope = dr.while_loop(
         (UInt32(0), first_cell, Array3f(0.0)),
@@ -104,10 +114,10 @@ def rock_surface(grain: Values, position: Values, normal: Values, footprint: Val
     # across the beds the slope is that of a rock without beds
     slope = _stretch(grain, slope) / (1.0 + grain.x**2 + grain.y**2 + grain.z**2)
     cell = Float64(FRACTURE_CELL * size)
-    depth = noise_in_space(list(stretched), cell, UInt32(7)) + 0.3 * noise_in_space(
-        list(stretched), 0.3 * cell, UInt32(8)
+    depth = noise_in_space(list(stretched), cell, UInt32(_FRACTURE_SEED)) + _FINE_FRACTURE * noise_in_space(
+        list(stretched), _FINE_FRACTURE * cell, UInt32(_FINE_FRACTURE_SEED)
     )
     width = larger(FRACTURE_WIDTH, footprint / Float(cell))
     fractures = FRACTURE_LOG_ALBEDO * FRACTURE_WIDTH / width * dr.exp(-dr.square(depth / width))
-    margin = MARGIN * noise_in_space(list(position), Float64(MARGIN_CELL * size), UInt32(11))
+    margin = MARGIN * noise_in_space(list(position), Float64(MARGIN_CELL * size), UInt32(_MARGIN_SEED))
     return RockSurface(slope, fractures, dust_cover(normal.z + margin))

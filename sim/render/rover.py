@@ -43,8 +43,9 @@ _EQUIPMENT = (
 #: Number of cleats of a wheel, their height, and radii of rim and hub, as fractions of the wheel's radius; number of
 #: spokes. Read from images of MER's wheels, accurate to about 10 %.
 _CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
-#: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; assumed.
-_STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
+#: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; radius of a
+#: bracket divided by that of a leg; sag of the cable along a leg, m; assumed.
+_STEERING_HEIGHT, _BRACKET_GAP_M, _BRACKET_RADIUS, _LEG_SAG_M = 1.6, 0.03, 0.7, 0.03
 #: Number of sides of the prism that represents a cylinder, and of segments of a cable.
 _SIDES, _SEGMENTS = 12, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
@@ -80,12 +81,16 @@ def rover_objects(
     """
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
-    # the axis of a wheel is y
+    # the axis of a wheel is y; normals are stretched by the inverse of the size
     wheel = (_unit_wheel() * np.stack([size, 1.0 / size]))[..., [1, 2, 0]]
     wheel[:, :, 1] /= np.linalg.norm(wheel[:, :, 1], axis=2, keepdims=True)
-    parts = {"deck": [_build_deck(rover)], "body": [_build_body(rover, stance)]}
-    parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
-    parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
+    parts = {
+        "deck": [_build_deck(rover)],
+        "body": [_build_body(rover, stance)],
+        # only points are moved, not normals
+        "wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres],
+        "mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)],
+    }
     bodies = [
         _create_body(_transform(solid, stance.world_from_rover), ALBEDOS[material])
         for material, solids in parts.items()
@@ -153,8 +158,8 @@ def _build_leg(rover: RoverParameters, pivot: Point, centre: Point, *, steers: b
         return [(pivot, hub, radius), (hub, centre, radius)]
     motor = hub + np.array([0.0, 0.0, _STEERING_HEIGHT * rover.wheel_radius_m])
     down = np.array([0.0, 0.0, 0.5 * rover.wheel_radius_m])
-    cable = _hang_cable(pivot, motor, np.array([0.0, 0.0, -0.03]))
-    bracket = [(motor, hub, 0.7 * radius), (hub, centre, radius)]
+    cable = _hang_cable(pivot, motor, np.array([0.0, 0.0, -_LEG_SAG_M]))
+    bracket = [(motor, hub, _BRACKET_RADIUS * radius), (hub, centre, radius)]
     return [(pivot, motor, radius), *bracket, (motor, motor - down, _LEG_M), *cable]
 
 
@@ -260,9 +265,11 @@ def _unit_wheel() -> Solid:
     radii = np.tile([1.0, 1.0, 1.0 - _CLEAT_HEIGHT], _CLEATS)
     angles = 2.0 * np.pi / _CLEATS * (np.arange(_CLEATS)[:, None] + np.array([-0.1, 0.1, 0.5])).ravel()
     outline = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    # heights and radii: over the crowned tread from one edge to the other, and back along the inside of the rim
     tread = [(-0.5, 0.9), (-0.36, 1.0), (0.36, 1.0), (0.5, 0.9), (0.42, _RIM), (-0.42, _RIM), (-0.5, 0.9)]
     axis = np.array([0.0, 0.0, 0.45])
     radial = [np.array([np.cos(a), np.sin(a), 0.0]) for a in 2.0 * np.pi * np.arange(_SPOKES) / _SPOKES]
+    # from the middle of the hub into the rim, slightly off its middle
     spokes = [(_HUB * d, (_RIM + 0.03) * d + 0.3 * axis, 0.07) for d in radial]
     return np.concatenate([_shade_flat(_stack_rings(tread, outline)), _make_cylinders([(-axis, axis, _HUB), *spokes])])
 

@@ -116,7 +116,7 @@ class Scene:
         return set(self.__dict__) - {field.name for field in fields(self)}
 
     def _replace(self, *results: str, **changes: Any) -> Scene:
-        """Return a changed scene that has these cached results of this one, which remain valid."""
+        """Return a changed scene with these results of this one, which remain valid; missing results are computed."""
         scene = replace(self, **changes)
         scene.__dict__.update({name: getattr(self, name) for name in results})
         return scene
@@ -231,7 +231,8 @@ class Scene:
         if self.clouds is not None:
             cloud_light = self.clouds.parameters.sky_light(self.sun)
             photometry = replace(photometry, sky_fraction=photometry.sky_fraction + cloud_light)
-            clouds = self.clouds.at_time(self.sun, time_s)
+            # without direct sunlight clouds cast no shadows
+            clouds = self.clouds.at_time(self.sun, time_s) if self.sun.direction[2] > 0.0 else None
         # clouds are not rendered, so they do not change the brightness of the sky
         return Light(
             Array3f64(*self.sun.direction.tolist()),

@@ -16,6 +16,7 @@ from scipy.special import expn
 
 from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, to_device, to_host
 from marsyard.sim.render.device import Array3f, Float, Float64
+from marsyard.sim.terrain.environment import MIN_SUN_SINE
 
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305
@@ -127,9 +128,10 @@ def single_scattering(mu: Values, mu0: Values, cos_g: Values, depth: Values, asy
     """Single-scattering radiance of a plane air layer from below, relative to direct sunlight, up to a factor.
 
     ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P and the
-    optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun.
+    optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun; at a lower sun than
+    that of `MIN_SUN_SINE`, direct sunlight is so weak that the ratio would overflow.
     """
-    mu, mu0 = larger(mu, MIN_ELEVATION_SINE), larger(mu0, MIN_ELEVATION_SINE)
+    mu, mu0 = larger(mu, MIN_ELEVATION_SINE), larger(mu0, MIN_SUN_SINE)
     # the limit for equal elevations avoids 0 / 0
     difference = depth / mu - depth / mu0
     path = dr.select(dr.abs(difference) < 1e-6, 1.0 - 0.5 * difference, (1.0 - dr.exp(-difference)) / difference)
@@ -199,7 +201,7 @@ class DustySky:
 
     def disc_fraction(self, sun_z: float) -> float:
         """Fraction of direct sunlight that comes from the sun's disc; the rest comes from the aureole."""
-        return float(np.exp((self.depth - self.optical_depth) / max(sun_z, MIN_ELEVATION_SINE)))
+        return float(np.exp((self.depth - self.optical_depth) / max(sun_z, MIN_SUN_SINE)))
 
     def model(self, sun_z: float, sky_fraction: float) -> Sky:
         """Return the sky whose irradiance without the forward peak is `sky_fraction`."""

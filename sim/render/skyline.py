@@ -55,8 +55,14 @@ class Skyline:
     def of(cls, relief: Relief) -> Skyline:
         """Copy relief to the device."""
         layers, azimuths = relief.elevations.shape
-        elevations, transmissions, steepness = (to_device(Float, values) for values in relief[:3])
-        return cls(elevations, transmissions, steepness, Float(relief.albedo), UInt32(layers), UInt32(azimuths))
+        return cls(
+            elevations=to_device(Float, relief.elevations),
+            transmissions=to_device(Float, relief.transmissions),
+            steepness=to_device(Float, relief.steepness),
+            albedo=Float(relief.albedo),
+            layers=UInt32(layers),
+            azimuths=UInt32(azimuths),
+        )
 
     def cover(self, sky: Values, direction: Values, law: Law, sun: Values, pixel_rad: Values) -> Values:
         """Return the radiance factor in directions, from that of the sky; upper edges are blurred over a pixel."""

@@ -20,6 +20,8 @@ from marsyard.sim.render.rays import Ray
 Triangles = FloatArray[np.ndarray, "triangles 3 3"]
 #: Relative margin of bounds and of triangles in single precision, larger than rounding errors.
 SLACK = 1e-6
+#: Bits of a Morton code along each axis; three of them fit into 64 bits.
+MORTON_BITS = 20
 #: Number of rays up to which testing all triangles takes less time than building their hierarchy.
 FEW_RAYS = 256
 
@@ -162,7 +164,8 @@ def first_hits(
     One origin, or one direction, may be that of all rays.
     """
     origins, directions = np.broadcast_arrays(origins, directions)
-    if len(triangles) == 0:
+    # Dr.Jit aborts the process for arrays without elements
+    if len(triangles) == 0 or len(origins) == 0:
         return np.full(len(origins), np.inf), np.full(len(origins), -1)
     corners = vectors_to_device(Array3f64, triangles.reshape(-1, 3))
     ray = Ray(vectors_to_device(Array3f64, origins), vectors_to_device(Array3f64, directions))
@@ -195,13 +198,13 @@ def _search_all(corners: Values, count: Values, ray: Ray) -> tuple[Values, Value
 
 
 def morton_codes(triangles: Triangles) -> Int64[np.ndarray, "triangles"]:
-    """Morton code of each triangle's centroid in the cube that contains all centroids, with 20 bits per axis."""
+    """Morton code of each triangle's centroid in the cube that contains all centroids, with `MORTON_BITS` per axis."""
     if len(triangles) == 0:
         return np.empty(0, dtype=np.int64)
     centroids = (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3.0
     low = centroids.min(axis=0)
     side = max(float((centroids - low).max()), 1e-12)
-    codes = ((centroids - low) / side * 1048575.0).astype(np.int64)
+    codes = ((centroids - low) / side * (2.0**MORTON_BITS - 1.0)).astype(np.int64)
     # move bit k of each code to bit 3 k
     for shift, mask in (
         (32, 0x1F00000000FFFF),

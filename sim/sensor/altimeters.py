@@ -223,7 +223,7 @@ def _search_nearest_ground(
     coordinates = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
     offsets = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
     nearest = np.inf
-    for grid in range(GRIDS):
+    for grids_left in reversed(range(GRIDS)):
         # range to the ground (smoothed to the step) at the offsets, and angle from the axis
         level = int(min(np.floor(np.log2(max(step_m / surface.spacing_m, 1.0))), len(surface.levels) - 1))
         x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
@@ -234,8 +234,8 @@ def _search_nearest_ground(
         is_in_cone = angles <= half_angle_rad
         if is_in_cone.any():
             nearest = float(ranges[is_in_cone].min())
-        if grid == GRIDS - 1:
-            return nearest
+        if grids_left == 0:
+            break
         # candidates: nodes within a step of the cone whose surroundings can contain nearer ground
         candidates = (angles <= half_angle_rad + step_m / ranges) & (
             ranges <= nearest + (RELIEF_PER_STEP + MAX_SLOPE) * step_m
@@ -249,5 +249,5 @@ def _search_nearest_ground(
         neighbours = np.stack(np.meshgrid(fine_coordinates, fine_coordinates), axis=-1).reshape(-1, 2)
         offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2))
         if not offsets.size:
-            return nearest
+            break
     return nearest

@@ -40,6 +40,12 @@ class CustomCamera(Parameters):
     @model_validator(mode="after")
     def _check_camera(self) -> CustomCamera:
         self.camera()
+        lens = {"o": "CAHVOR", "r": "CAHVOR", "e": "CAHVORE", "linearity": "CAHVORE"}
+        unused = [
+            name for name, first in lens.items() if len(self.model) < len(first) and getattr(self, name) is not None
+        ]
+        if unused:
+            raise ValueError(f"{self.model} has no {' and '.join(unused)}")
         return self
 
     def camera(self) -> CameraModel:
@@ -90,15 +96,17 @@ def _resolve_camera(values: object) -> object:
     if unknown:
         raise ValueError(f"unknown key {unknown[0]} for a camera file; allowed: {', '.join(_FILE_KEYS)}")
     path, number, folded = str(values["file"]), values.get("number", 0), values.get("subframe_folded_in", False)
+    if not isinstance(folded, bool):
+        raise ValueError(f"{path}: subframe_folded_in is {folded!r}; allowed: true or false")
     size = values.get("size")
     if size is not None and not (isinstance(size, list | tuple) and [type(value) for value in size] == [int, int]):
         raise ValueError(f"{path}: size is {size!r}; allowed: [columns, rows]")
-    cameras = read_cameras(path, subframe_folded_in=bool(folded), size=None if size is None else (size[0], size[1]))
+    cameras = read_cameras(path, subframe_folded_in=folded, size=None if size is None else (size[0], size[1]))
     if not (isinstance(number, int) and 0 <= number < len(cameras)):
         raise ValueError(f"{path}: number is {number!r}; allowed: 0 to {len(cameras) - 1}")
     if len(cameras) > 1 and "number" not in values:
         raise ValueError(f"{path}: contains {len(cameras)} cameras; set number, 0 to {len(cameras) - 1}")
-    return CustomCamera.from_camera(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
+    return CustomCamera.from_camera(cameras[number], file=path, number=number, subframe_folded_in=folded)
 
 
 def _resolve_camera_or_preset(value: object) -> object:

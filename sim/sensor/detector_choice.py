@@ -90,7 +90,13 @@ class Datasheet(Parameters):
         """Create the light path from the sun to electrons."""
         q, lens = self.quantum_efficiency, self.lens
         curve = (lens.band_nm, (q, q)) if isinstance(q, float) else (q.wavelength_nm, q.efficiency)
-        return LightPath(lens.f_number, self.pixel_pitch_um, lens.band_nm, None, lens.transmission, curve)
+        return LightPath(
+            f_number=lens.f_number,
+            pixel_pitch_um=self.pixel_pitch_um,
+            band_nm=lens.band_nm,
+            transmission=lens.transmission,
+            quantum_efficiency=curve,
+        )
 
     def parameters(self) -> DetectorParameters:
         """Create the parameters of the simulated detector, which reads out all pixels."""

@@ -28,9 +28,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import Parameters, Positive
-from marsyard.sim.sensor.gps import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, STANDARD_GRAVITY_M_S2, ImuParameters
 from marsyard.sim.sensor.kernels import navigation as kernels
+from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
 
@@ -120,21 +120,23 @@ class NavigationFilter:
         accelerometer_bias = float(np.linalg.norm(np.array(biases_mg))) * 1e-3 * STANDARD_GRAVITY_M_S2
         dip_error_deg = float(compass.tilt_bias_deg * np.tan(np.radians(compass.dip_deg)))
         heading_biases_deg = [compass.heading_bias_deg, compass.hard_iron_deg, compass.soft_iron_deg, dip_error_deg]
-        # in the order of the error vector
-        deviations = np.concatenate(
-            [
-                np.repeat([parameters.initial_position_sd_m, parameters.initial_velocity_sd_m_s], 3),
-                np.radians(
-                    [parameters.initial_tilt_sd_deg, parameters.initial_tilt_sd_deg, parameters.initial_heading_sd_deg]
-                ),
-                np.repeat([gyro_bias, accelerometer_bias, 1.0], 3),
-                self.rtk.velocity_wander_m_s,
-                [float(np.radians(np.linalg.norm(np.array(heading_biases_deg))))],
-                np.full(2, np.radians(compass.tilt_bias_deg)),
-            ]
-        )
-        # no solution yet, acceleration zero, no rejected solutions
-        memory = np.array([-1.0, 0.0, 0.0, 0.0, 0.0])
+        tilt_deg, heading_deg = parameters.initial_tilt_sd_deg, parameters.initial_heading_sd_deg
+        deviations = np.empty(kernels.ERRORS)
+        for first_error, values in (
+            (kernels.POSITION, np.full(3, parameters.initial_position_sd_m)),
+            (kernels.VELOCITY, np.full(3, parameters.initial_velocity_sd_m_s)),
+            (kernels.ATTITUDE_ERROR, np.radians([tilt_deg, tilt_deg, heading_deg])),
+            (kernels.GYRO_BIAS, np.full(3, gyro_bias)),
+            (kernels.ACCELEROMETER_BIAS, np.full(3, accelerometer_bias)),
+            (kernels.POSITION_WANDER, np.ones(3)),
+            (kernels.VELOCITY_WANDER, np.array(self.rtk.velocity_wander_m_s)),
+            (kernels.HEADING_BIAS, np.radians([np.linalg.norm(np.array(heading_biases_deg))])),
+            (kernels.TILT_BIAS, np.full(2, np.radians(compass.tilt_bias_deg))),
+        ):
+            deviations[first_error : first_error + len(values)] = values
+        # no rejected solutions, and acceleration zero
+        memory = np.zeros(kernels.MEMORY)
+        memory[kernels.LAST_FIX] = kernels.NO_FIX
         return FilterState(state, np.diag(deviations**2), memory)
 
     def run(

@@ -54,8 +54,8 @@ def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> Coun
     return np.asarray(expansion_table(full_scale_dn)[codes])
 
 
-#: Allowed compressed sizes, bits per pixel.
-MIN_BITS, MAX_BITS = 0.1, 16.0
+#: Allowed compressed sizes, bits per pixel; minimum side of an image, which the coder halves five times.
+MIN_BITS, MAX_BITS, MIN_SIDE_PX = 0.1, 16.0, 32
 
 
 def compress_and_decompress(
@@ -64,8 +64,13 @@ def compress_and_decompress(
     """Compress an image to `bits_per_pixel` and decompress it; no change if lossless coding needs fewer bits.
 
     Counts above `full_scale_dn`, from ringing at edges, are clipped. Raises ValueError if `bits_per_pixel` is not
-    within `MIN_BITS` and `MAX_BITS`.
+    within `MIN_BITS` and `MAX_BITS`, or a side of the image is below `MIN_SIDE_PX`.
     """
+    if min(counts.shape) < MIN_SIDE_PX:
+        columns, rows = counts.shape[::-1]
+        raise ValueError(
+            f"an image of {columns} x {rows} pixels; allowed for compression: from {MIN_SIDE_PX} on each side"
+        )
     if not MIN_BITS <= bits_per_pixel <= MAX_BITS:
         raise ValueError(f"{bits_per_pixel:g} bits per pixel; allowed: {MIN_BITS:g} to {MAX_BITS:g}")
     # the unit of this option is 16/1000 bits per pixel

@@ -63,6 +63,7 @@ class ImageMotion:
         body_from_world = world_from_body.rotation.inv()
         point_velocities = -body_from_world.apply(velocity_m_s) - np.cross(body_from_world.apply(rate_rad_s), points)
         pixels = np.einsum("...ij,...j->...i", camera.projection_jacobian(points), point_velocities)
+        # from (u, v) to rows and columns
         # nodes outside the field of view have zero motion; no pixel of the image uses them
         return cls(np.ascontiguousarray(np.nan_to_num(pixels[..., ::-1])))
 

@@ -180,32 +180,28 @@ class Imu:
     def draw(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
         """Draw the errors for use within a time span."""
         p = parameters
-
-        def draw_triad(
-            sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float
-        ) -> Triad:
-            """Draw the errors of three sensors; `biases`: constant bias, bias change per K, and wander, SI units."""
-            bias, per_k, wander = biases
-            return Triad(
-                bias=bias * rng.standard_normal(3),
-                bias_per_k=per_k * rng.standard_normal(3),
-                wander=GaussMarkov.draw(np.full(3, wander), wander_s, span_s, rng),
-                warm_up=p.warm_up,
-                scale=1e-6 * getattr(p, f"{sensor}_scale_ppm") * rng.standard_normal(3),
-                misalignment=1e-3
-                * getattr(p, f"{sensor}_misalignment_mrad")
-                * (rng.standard_normal((3, 3)) * (1.0 - np.eye(3))),
-                random_walk=random_walk,
-                count=count,
-            )
-
-        biases = (p.gyro_bias_deg_h * DEG_H, p.gyro_bias_deg_h_k * DEG_H, p.gyro_wander_deg_h * DEG_H)
-        walk = p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H
-        gyro = draw_triad("gyro", biases, p.gyro_wander_s, walk, p.gyro_count_rad)
-        biases_mg = (p.accelerometer_bias_mg, p.accelerometer_bias_mg_k, p.accelerometer_wander_mg)
-        biases = (biases_mg[0] * MILLI_G, biases_mg[1] * MILLI_G, biases_mg[2] * MILLI_G)
-        walk = 1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G
-        accelerometer = draw_triad("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
+        # in each triad the errors are drawn in the order of its fields
+        gyro = Triad(
+            bias=p.gyro_bias_deg_h * DEG_H * rng.standard_normal(3),
+            bias_per_k=p.gyro_bias_deg_h_k * DEG_H * rng.standard_normal(3),
+            wander=GaussMarkov.draw(np.full(3, p.gyro_wander_deg_h * DEG_H), p.gyro_wander_s, span_s, rng),
+            warm_up=p.warm_up,
+            scale=1e-6 * p.gyro_scale_ppm * rng.standard_normal(3),
+            misalignment=1e-3 * p.gyro_misalignment_mrad * _draw_off_diagonal(rng),
+            random_walk=p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
+            count=p.gyro_count_rad,
+        )
+        force_wander = np.full(3, p.accelerometer_wander_mg * MILLI_G)
+        accelerometer = Triad(
+            bias=p.accelerometer_bias_mg * MILLI_G * rng.standard_normal(3),
+            bias_per_k=p.accelerometer_bias_mg_k * MILLI_G * rng.standard_normal(3),
+            wander=GaussMarkov.draw(force_wander, p.accelerometer_wander_s, span_s, rng),
+            warm_up=p.warm_up,
+            scale=1e-6 * p.accelerometer_scale_ppm * rng.standard_normal(3),
+            misalignment=1e-3 * p.accelerometer_misalignment_mrad * _draw_off_diagonal(rng),
+            random_walk=1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G,
+            count=p.accelerometer_count_m_s,
+        )
         return cls(parameters, gyro, accelerometer, Clock.draw(p.clock, rng))
 
     def boundaries(self, start_s: float, end_s: float) -> Boundaries:
@@ -233,6 +229,11 @@ class Imu:
         """Compute the increments between the same boundaries without errors; the time tags are true times."""
         boundaries = self.boundaries(start_s, end_s)
         return ImuIncrements(boundaries, 1.0 / self.parameters.rate_hz, *true_increments(trajectory, boundaries))
+
+
+def _draw_off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
+    """Draw a matrix of standard normal numbers with a zero diagonal."""
+    return np.asarray(rng.standard_normal((3, 3)) * (1.0 - np.eye(3)))
 
 
 def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[Vectors, Vectors]:

@@ -14,6 +14,7 @@ from marsyard.sim.error_sources import OPTICS
 from marsyard.sim.parameters import NonNegative, Parameters
 
 KERNEL_HALF_SIZE_PX = 6  #: Half size of the point spread kernel, pixels.
+_FREQUENCIES = 513  #: Number of frequencies, up to the Nyquist frequency, of the modulation transfer function.
 Image = Float32[np.ndarray, "rows columns"]
 #: Factor q of the field angle in the projected pupil area of a fisheye, cos(q theta): from a MER front hazcam, the sky
 #: of Opportunity image 1F483288473EFFCMUFP1214L0M1, 60 to 85 deg off axis (not flat-fielded; accuracy 10 %).
@@ -50,7 +51,7 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     defocus, 2 J1(x) / x with x = pi d f for a uniform disc of diameter d, and optionally of the pixel aperture,
     sinc(f). Rows and columns are treated as separable, which is an approximation for a round pupil.
     """
-    frequency = np.linspace(0.0, 0.5, 513)
+    frequency = np.linspace(0.0, 0.5, _FREQUENCIES)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
     if parameters.pixel_aperture:
         transfer = transfer * np.sinc(frequency)

@@ -41,6 +41,7 @@ _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
 #: Exposure of cameras without a given exposure time: at the radiance factor 0.3 a pixel collects 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
+_WAVELENGTHS = 281  #: Number of wavelengths over a passband: every 2.5 nm from 400 to 1100 nm.
 Spectrum = Float64[np.ndarray, "n"]  #: One value per wavelength.
 
 
@@ -81,7 +82,7 @@ class LightPath:
 
     def _filtered_electrons(self) -> tuple[Spectrum, Spectrum]:
         """Return wavelengths, and electrons per second, m2 and nm behind the filter without the lens at 1 AU."""
-        wavelength_nm = np.linspace(*self.band_nm, 281)
+        wavelength_nm = np.linspace(*self.band_nm, _WAVELENGTHS)
         if self.quantum_efficiency is None:
             efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
         else:

@@ -98,7 +98,7 @@ class TiltCompass:
         p = self.parameters
         lagged_up = self._compute_lagged_up(trajectory, times_s)
         tags = self.clock.tags(times_s, rng)
-        noise = rng.standard_normal((times_s.size, 3))
+        tilt_noise, heading_noise = np.split(rng.standard_normal((times_s.size, 3)), [2], axis=1)
         biased_up = _add_offset(lagged_up, self.tilt_bias_rad)
         # azimuths from the magnetic field, projected on the plane perpendicular to the measured up directions
         dip = np.radians(p.dip_deg)
@@ -106,10 +106,10 @@ class TiltCompass:
         magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
         north = _normalize(magnetic - np.sum(magnetic * biased_up, axis=1)[:, None] * biased_up)
         azimuths = np.arctan2(np.cross(north, biased_up)[:, 0], north[:, 0])
-        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * noise[:, 2]
+        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * heading_noise[:, 0]
         if p.count_deg > 0.0:
             headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
-        up = _add_offset(biased_up, np.radians(p.tilt_noise_deg) * noise[:, :2])
+        up = _add_offset(biased_up, np.radians(p.tilt_noise_deg) * tilt_noise)
         headings = _hold_stuck_readings(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s)
         return TiltCompassReadings(tags, _hold_stuck_readings(up, times_s, p.tilt_stuck_s), headings)
 

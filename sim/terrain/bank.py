@@ -15,13 +15,15 @@ from marsyard.sim.streams import substream
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.surface import Surface, empty_aligned, level_sides
+from marsyard.sim.terrain.surface import UNIFORM, Surface, empty_aligned, level_sides
 from marsyard.sim.terrain.synthesis import synthesise
 
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "statistics.py")
 #: Beginning of the identity of a terrain on an imported DTM.
 IMPORTED_TERRAIN = "DTM"
+#: Bytes of a sample, and number of factors of the ground (`Surface.factors`).
+_SAMPLE_BYTES, _FACTORS = np.dtype(np.float32).itemsize, UNIFORM.shape[-1]
 #: Maximum number of terrains of a bank: one for each case of the largest campaign.
 MAX_TERRAINS = 1_000_000_000
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
@@ -70,7 +72,7 @@ class TerrainBank:
         if samples is None:
             samples = self._build_samples(number)
             try:
-                evict_files(path.parent, 4 * self._size(), set(_IN_USE))
+                evict_files(path.parent, _SAMPLE_BYTES * self._size(), set(_IN_USE))
                 samples = save_array(path, samples)
             except OSError as error:
                 warnings.warn(f"terrain {number} is not stored: {path}: {error.strerror}", CacheWarning, stacklevel=2)
@@ -99,12 +101,12 @@ class TerrainBank:
         """Create the surface from the samples of a terrain."""
         _IN_USE[path] = samples
         factor_side = self._factor_side()
-        pyramid, factors = np.split(samples, [samples.size - 3 * factor_side**2])
-        return Surface(pyramid, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
+        pyramid, factors = np.split(samples, [samples.size - _FACTORS * factor_side**2])
+        return Surface(pyramid, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, _FACTORS))
 
     def missing_bytes(self, number: int) -> int:
         """Return the bytes that a terrain would add on disk, without the header of the file; 0 if it is stored."""
-        return 0 if self._path(number).exists() else 4 * self._size()
+        return 0 if self._path(number).exists() else _SAMPLE_BYTES * self._size()
 
     def rocks(self, number: int, surface: Surface) -> RockField | None:
         """Build the rocks of a terrain on its surface; they are not stored. None if the parameters have no rocks."""
@@ -138,7 +140,8 @@ class TerrainBank:
 
     def _size(self) -> int:
         """Return the number of float32 values in the file of a terrain."""
-        return 2 * sum(side**2 for side in level_sides(self.parameters.samples)) + 3 * self._factor_side() ** 2
+        # height and albedo of each level's samples
+        return 2 * sum(side**2 for side in level_sides(self.parameters.samples)) + _FACTORS * self._factor_side() ** 2
 
     def _factor_side(self) -> int:
         """Return the side of the grid of `Surface.factors`."""

@@ -1,6 +1,7 @@
 """Digital terrain models (DTM) from files, embedded in periodic synthetic terrain."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -20,6 +21,13 @@ from marsyard.sim.terrain.rasters import (
     read_rasters,
 )
 
+DEFORMATION_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
+#: Iterations of the relaxation in holes, and of that on each grid outside the DTM.
+_HOLE_ITERATIONS, _BORDER_ITERATIONS = 200, 60
+MIN_RELATIVE_BRIGHTNESS = 0.2  #: Lower limit of an orthoimage's brightness divided by its mean.
+#: Minimum and maximum number of samples along a side of a terrain; minimum ratio of its side and the DTM's in samples.
+MIN_SIDE, MAX_SIDE, MIN_SIDE_RATIO = 64, 8192, 1.5
+ORTHO_EDGE_MARGIN_PX = 3  #: Width of the margin around missing pixels where resampling has mixed values with black.
 GridPatch = Float32[np.ndarray, "rows columns"]
 
 
@@ -39,14 +47,6 @@ def fill_holes(values: Grid) -> tuple[Grid, int]:
         neighbour_mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
         filled[missing] = neighbour_mean[missing]
     return filled, holes
-
-
-DEFORMATION_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
-#: Iterations of the relaxation in holes, and of that on each grid outside the DTM.
-_HOLE_ITERATIONS, _BORDER_ITERATIONS = 200, 60
-MIN_RELATIVE_BRIGHTNESS = 0.2  #: Lower limit of an orthoimage's brightness divided by its mean.
-MAX_SIDE = 8192  #: Maximum number of samples along a side of a terrain.
-ORTHO_EDGE_MARGIN_PX = 3  #: Width of the margin around missing pixels where resampling has mixed values with black.
 
 
 @dataclass(frozen=True)
@@ -118,6 +118,11 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
             f"{source.dtm} covers {width:g} m x {length:g} m; "
             f"it must be wider than twice the border ({source.border_m:g} m)"
         )
+    # the sample at the centre of the terrain is then inside the border
+    if min(width, length) <= spacing_m:
+        raise TerrainFileError(
+            f"{source.dtm} covers {width:g} m x {length:g} m; it must be wider than terrain.spacing_m, {spacing_m:g} m"
+        )
     heights, holes = fill_holes(raster.values)
     # align the DTM with the grid: posts coincide with samples if the posting is a multiple of the spacing
     west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))
@@ -164,10 +169,10 @@ def _blending_weight(border_m: float, x: tuple[Coordinates, float], y: tuple[Coo
 
 def _ortho_weight(source: RealTerrain, raster: Raster, ortho: Raster, x: Coordinates, y: Coordinates) -> GridPatch:
     """Return the blending weight of the orthoimage, whose pixels are squares."""
-    east_m, north_m = (start - 0.5 * ortho.posting_m for start in ortho_origin(source, raster, ortho))
+    west_m, south_m = (start - 0.5 * ortho.posting_m for start in ortho_origin(source, raster, ortho))
     rows, columns = ortho.values.shape
     width, length = columns * ortho.posting_m, rows * ortho.posting_m
-    return _blending_weight(source.border_m, (x - east_m, width), (y - north_m, length))
+    return _blending_weight(source.border_m, (x - west_m, width), (y - south_m, length))
 
 
 def _resample_log_brightness(
@@ -201,16 +206,19 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     """
     raster, _ = read_rasters(source)
     longest = max(raster.values.shape)
-    # the terrain's side is the power of two that is at least 1.5 times that of the DTM
-    samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
+    # the side is a power of two
+    samples = max(MIN_SIDE, 1 << int(np.ceil(np.log2(MIN_SIDE_RATIO * longest))))
     if samples > MAX_SIDE:
-        # 5461 is MAX_SIDE / 1.5
-        raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: 5461")
+        allowed = int(MAX_SIDE / MIN_SIDE_RATIO)
+        raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: {allowed}")
     return samples, raster.posting_m
 
 
-#: Height (m) and logarithm of albedo of the synthetic detail that is finer than a DTM, in the area of the DTM.
-Detail = tuple[GridPatch, GridPatch]
+class Detail(NamedTuple):
+    """Height (m) and logarithm of albedo of the synthetic detail that is finer than a DTM, in the area of the DTM."""
+
+    height: GridPatch
+    log_albedo: GridPatch
 
 
 def extract_fine_detail(ground: TerrainGround, dtm: EmbeddedDtm) -> Detail:
@@ -220,10 +228,7 @@ def extract_fine_detail(ground: TerrainGround, dtm: EmbeddedDtm) -> Detail:
     """
     sigma = dtm.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
     grids = (ground.height, ground.log_albedo)
-    height, log_brightness = (
-        (grid - gaussian_filter(grid, sigma, mode="wrap"))[dtm.rows, dtm.columns] for grid in grids
-    )
-    return height, log_brightness
+    return Detail(*((grid - gaussian_filter(grid, sigma, mode="wrap"))[dtm.rows, dtm.columns] for grid in grids))
 
 
 def blend_into_ground(ground: TerrainGround, dtm: EmbeddedDtm, detail: Detail | None) -> None:
@@ -232,7 +237,7 @@ def blend_into_ground(ground: TerrainGround, dtm: EmbeddedDtm, detail: Detail | 
     First the synthetic ground is deformed to meet the DTM at its border. The deformation is the height difference at
     the border, extrapolated by Laplace's equation on a coarse periodic grid.
     """
-    height = dtm.height if detail is None else dtm.height + detail[0]
+    height = dtm.height if detail is None else dtm.height + detail.height
     step = max(ground.side // DEFORMATION_SIDE, 1)
     is_covered = np.zeros((ground.side, ground.side), dtype=bool)
     is_covered[dtm.rows, dtm.columns] = dtm.weight > 0.0
@@ -243,7 +248,7 @@ def blend_into_ground(ground: TerrainGround, dtm: EmbeddedDtm, detail: Detail | 
     region = ground.height[dtm.rows, dtm.columns]
     region += dtm.weight * (height - region)
     if dtm.log_brightness is not None:
-        log_brightness = dtm.log_brightness if detail is None else dtm.log_brightness + detail[1]
+        log_brightness = dtm.log_brightness if detail is None else dtm.log_brightness + detail.log_albedo
         region = ground.log_albedo[dtm.rows, dtm.columns]
         region += dtm.brightness_weight * (log_brightness - region)
 

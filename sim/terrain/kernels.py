@@ -1,4 +1,4 @@
-"""Compiled kernels of the terrain: evaluation of the cubic B-spline, upper height bounds, and coarser levels."""
+"""Compiled kernels of the terrain: evaluation, refinement and height bounds of the B-spline, and levels of samples."""
 
 import math
 
@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 
 #: A level of the pyramid, shape (side, side, 2): height and albedo; side is a power of two.
 Level = NDArray[np.float32]
+#: Values of one quantity on a periodic grid, shape (side, side).
+Grid = NDArray[np.float32]
 Array = NDArray[np.float64]
-#: Weights of four control values, and their derivatives.
-WeightsAndDerivatives = tuple[float, float, float, float, float, float, float, float]
+#: One number for each of four successive control values.
+Weights = tuple[float, float, float, float]
 
 
 @njit(cache=True, inline="always")
-def bspline_weights(t: float) -> WeightsAndDerivatives:
+def bspline_weights(t: float) -> tuple[Weights, Weights]:
     """Compute the weights of the four control values around a point at fraction t of a cell, and their derivatives."""
     s = 1.0 - t
     t2 = t * t
@@ -27,7 +29,7 @@ def bspline_weights(t: float) -> WeightsAndDerivatives:
     d3 = 0.5 * t2
     d1 = t * (1.5 * t - 2.0)
     d2 = -d0 - d1 - d3
-    return w0, w1, w2, w3, d0, d1, d2, d3
+    return (w0, w1, w2, w3), (d0, d1, d2, d3)
 
 
 @njit(cache=True, inline="always")
@@ -39,8 +41,8 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
     gy = y * inverse_spacing
     fx, fy = math.floor(gx), math.floor(gy)
     j, i = int(fx), int(fy)
-    wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(gx - fx)
-    wy = bspline_weights(gy - fy)
+    (wx0, wx1, wx2, wx3), (dx0, dx1, dx2, dx3) = bspline_weights(gx - fx)
+    wy, dy = bspline_weights(gy - fy)
     j0, j1, j2, j3 = (j - 1) & mask, j & mask, (j + 1) & mask, (j + 2) & mask
     height, slope_x, slope_y, albedo = 0.0, 0.0, 0.0, 0.0
     for k in range(4):
@@ -48,7 +50,7 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
         h0, h1, h2, h3 = row[j0, 0], row[j1, 0], row[j2, 0], row[j3, 0]
         row_height = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
         height += wy[k] * row_height
-        slope_y += wy[k + 4] * row_height
+        slope_y += dy[k] * row_height
         slope_x += wy[k] * (dx0 * h0 + dx1 * h1 + dx2 * h2 + dx3 * h3)
         albedo += wy[k] * (wx0 * row[j0, 1] + wx1 * row[j1, 1] + wx2 * row[j2, 1] + wx3 * row[j3, 1])
     return height, slope_x * inverse_spacing, slope_y * inverse_spacing, albedo
@@ -60,7 +62,7 @@ def collapse(field: Level, gy: float, out: Array) -> None:
     mask = field.shape[0] - 1
     fy = math.floor(gy)
     i = int(fy)
-    wy = bspline_weights(gy - fy)
+    wy, _dy = bspline_weights(gy - fy)
     for j in range(field.shape[1]):
         for c in range(2):
             out[j, c] = (
@@ -134,3 +136,37 @@ def reduce_level(fine: Level) -> Level:
                 for c in range(2):
                     coarse[i, j, c] += weights[k] * half_width[source, j, c]
     return coarse
+
+
+@njit(cache=True)
+def add_refined(fine: Grid, coarse: Grid) -> None:
+    """Upsample a coarse grid of cubic B-spline coefficients by two (exact subdivision), and add it to the fine grid."""
+    side = coarse.shape[0]
+    row = np.empty(side, dtype=np.float32)
+    one_eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
+    for i in range(2 * side):
+        k = i // 2
+        current = coarse[k]
+        following = coarse[(k + 1) % side]
+        if i % 2 == 0:
+            previous = coarse[k - 1]
+            for j in range(side):
+                row[j] = one_eighth * (previous[j] + following[j]) + six_eighths * current[j]
+        else:
+            for j in range(side):
+                row[j] = half * (current[j] + following[j])
+        fine_row = fine[i]
+        for j in range(side - 1):
+            fine_row[2 * j] += one_eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
+            fine_row[2 * j + 1] += half * (row[j] + row[j + 1])
+        fine_row[2 * side - 2] += one_eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
+        fine_row[2 * side - 1] += half * (row[side - 1] + row[0])
+
+
+@njit(cache=True)
+def interleave_samples(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
+    """Interleave height and albedo; the albedo is scaled and limited to 1."""
+    for i in range(height.shape[0]):
+        for j in range(height.shape[0]):
+            samples[i, j, 0] = height[i, j]
+            samples[i, j, 1] = min(scale * albedo[i, j], 1.0)

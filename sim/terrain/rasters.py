@@ -95,8 +95,10 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
 
 def _full_turns(heights: Raster, ortho: Raster, full_turn_m: float) -> int:
     """Return the number of full turns of longitude from the DTM's centre to that of its orthoimage."""
-    centres = (raster.west_m + 0.5 * raster.posting_m * raster.values.shape[1] for raster in (ortho, heights))
-    return round(float(next(centres) - next(centres)) / full_turn_m)
+    heights_m, ortho_m = (
+        raster.west_m + 0.5 * raster.posting_m * raster.values.shape[1] for raster in (heights, ortho)
+    )
+    return round(float(ortho_m - heights_m) / full_turn_m)
 
 
 def ortho_origin(source: RealTerrain, heights: Raster, ortho: Raster) -> tuple[float, float]:
@@ -176,6 +178,8 @@ def _create_raster(values: Any, posting_m: float, path: Path) -> Raster:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or min(array.shape) < 4:
         raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
+    if not 0.0 < posting_m < np.inf:
+        raise TerrainFileError(f"{path} has a distance of {posting_m:g} m between grid points; it must be positive")
     array = np.where(np.isfinite(array), array, np.nan)
     return Raster(array[::-1].copy(), posting_m, 0.5 * posting_m, (0.5 - array.shape[0]) * posting_m)
 
@@ -243,8 +247,9 @@ def read_brightness(file: Any) -> Grid:
         brightness += _palette_luminance(file.colormap(1))[file.read(1)]
     else:
         is_colour = "red" in names
+        grey = next((number for number, name in enumerate(names, start=1) if name != "alpha"), 1)
         for number, name in zip(file.indexes, names, strict=True):
-            weight = LUMINANCE.get(name, 0.0) if is_colour else float(number == 1)
+            weight = LUMINANCE.get(name, 0.0) if is_colour else float(number == grey)
             if weight == 0.0:
                 continue
             band = file.read(number)

@@ -5,9 +5,9 @@ from jaxtyping import Float32
 
 from marsyard.sim.streams import substream
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
+from marsyard.sim.terrain.kernels import interleave_samples
 from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.ground import TerrainGround, refine
-from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
 from marsyard.sim.terrain.landforms.random_fields import FractalField
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import TerrainParameters
@@ -73,7 +73,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 def _add_fine_ground(
     ground: TerrainGround, fine: TerrainGround, factors: Float32[np.ndarray, "side side 3"], relief_log_albedo: float
 ) -> None:
-    """Add fine relief and albedo, scaled by the factors of the surface units.
+    """Add fine relief and albedo, scaled by the factors of the surface units, to the ground; changes both in place.
 
     With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``.
     The log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy.special import expit
 
-from marsyard.reports.influences import boundary_section, fit_probability, validate_fit
+from marsyard.reports.failure_boundary import boundary_section, fit_probability, validate_fit
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 
@@ -58,6 +58,16 @@ def test_fitted_probability_is_close_to_the_true_one() -> None:
     sun, off_nadir = rng.uniform(22.0, 58.0, 1000), rng.uniform(2.0, 28.0, 1000)
     errors = probability(np.stack([sun, off_nadir], axis=1)) - true_probability(sun, off_nadir)
     assert np.sqrt(np.mean(errors**2)) < 0.05
+
+
+def test_condition_that_few_terrains_have_is_validated_over_cases() -> None:
+    frame = make_rows(800, seed=1)
+    frame.loc[frame["terrain"] >= 4, "sun_elevation_deg"] = np.nan
+    sun = frame["sun_elevation_deg"].fillna(40.0)
+    frame["velocity_error_m_s"] = np.where(sun + frame["off_nadir_max_deg"] < 55.0, 9.0, 1.0)
+    # four terrains are fewer than the folds of the cross-validation
+    (fit,) = make_section(frame).data["VEL"]
+    assert fit["cases"] == (frame["terrain"] < 4).sum()
 
 
 def test_violations_without_a_cause_have_no_boundary() -> None:

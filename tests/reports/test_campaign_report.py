@@ -276,4 +276,5 @@ def test_records_contain_no_variables_and_no_folder_of_the_user(
     assert "secret" not in json.dumps(describe_machine())
     monkeypatch.setenv("HOME", str(tmp_path))
     assert hide_folders(f"cannot read '{tmp_path}/a', {tmp_path}-b") == f"cannot read '~/a', {tmp_path}-b"
+    assert hide_folders(f"{tmp_path}.b is not in {tmp_path}.") == f"{tmp_path}.b is not in ~."
     assert ExecutorConfig(cluster="tcp://login.example:8786").describe() == "cluster"

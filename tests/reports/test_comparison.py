@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid, compare_campaigns, list_metrics
-from marsyard.reports.common_sections import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.comparison import compare_algorithms, select_algorithm
+from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.statistics.difference_tests import difference_p_value
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import MakeRun, make_rows
@@ -62,21 +62,21 @@ def test_columns_of_a_compared_algorithm_are_selected() -> None:
 
 def test_correct_covariances_are_consistent_at_95_percent() -> None:
     rng = np.random.default_rng(7)
-    verdicts = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
+    verdicts = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng)).word for _ in range(400)]
     # 0.95, minus 4 and plus 3 standard deviations of 1.1 %
     assert 0.91 <= verdicts.count("consistent") / 400 <= 0.985
     overconfident = evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
-    assert overconfident["word"] == "optimistic"
-    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "pessimistic"
+    assert overconfident.word == "optimistic"
+    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0).word == "pessimistic"
 
 
 @pytest.mark.parametrize("column", ["velocity_nees", "position_nees"])
 def test_consistency_covers_all_algorithms_with_covariances(column: str) -> None:
     frame = make_paired_rows([1, 2, 3], [3, 4, 5]).assign(**{f"other.{column}": [2.0, 2.0, np.nan]})
     ((name, values),) = evaluate_consistencies(frame).items()
-    assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")
+    assert (name, values.n, values.mean, values.word) == ("other", 2, 2.0, "consistent")
     # the sum of two values with two degrees of freedom each
-    assert values["lower"] == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
+    assert values.lower == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
 
 
 def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
@@ -122,6 +122,13 @@ def test_campaigns_with_different_draws_are_compared_as_two_samples(make_run: Ma
     assert worse_comparisons["velocity error (m/s)"].p_value < 1e-3
     grid = campaign_diff_grid(["a", "b"], list(worse_comparisons.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
+
+
+def test_campaigns_without_terrains_are_compared_case_by_case(make_run: MakeRun) -> None:
+    first, worse = (make_rows(200, answer_rate=rate).drop(columns="terrain") for rate in (0.9, 0.5))
+    definition = {"parameters": {"site": "meridiani"}}
+    _, comparisons = _compare(make_run(first), make_run(worse, name="worse", definition=definition))
+    assert comparisons["answered"].p_value < 1e-6
 
 
 def test_terrains_of_different_sites_are_not_paired(make_run: MakeRun) -> None:

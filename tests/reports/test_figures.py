@@ -49,6 +49,13 @@ def test_figures_are_well_formed(cases: int, bound: float | None) -> None:
         assert root.get("viewBox")
 
 
+def test_all_figures_have_the_style_of_the_page() -> None:
+    for figure in _draw_all_figures(make_rows(24, answer_rate=1.0), 5.0):
+        assert figure is not None
+        # the page's style has no upper spine; matplotlib's own style has one
+        assert not figure.axes[0].spines["top"].get_visible()
+
+
 def test_missing_data_give_no_figure() -> None:
     frame = make_rows(5, answer_rate=0.0)
     assert error_scatter(frame, METRIC, 5.0) is None
@@ -152,6 +159,13 @@ def test_points_beyond_the_axes_are_marked_and_counted() -> None:
         == count_beyond_axis(frame, METRIC, "off_nadir_max_deg", 5.0)
         == (frame[METRIC] > 15.0).sum()
     )
+
+
+def test_constant_parameter_has_a_visible_bar() -> None:
+    figure = draws_figure("constant", [ParameterSample("sun.optical_depth", [1.0 / 3.0] * 20)])
+    (bar,) = (patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle))
+    assert bar.get_width() == pytest.approx(0.7)
+    assert bar.get_height() == 20.0
 
 
 def _make_draws() -> list[ParameterSample]:

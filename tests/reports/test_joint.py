@@ -99,6 +99,19 @@ def test_counts_in_the_record_keep_the_evidence(cases: list[tuple[bool, bool, in
     assert not CaseEvidence.from_rows(rows, is_first=False).in_first_look.any()
 
 
+def test_confirmations_share_terrains_also_if_a_case_has_none() -> None:
+    """A crashed case without a terrain changes the type of the column, but not the terrains of the others."""
+    frame = make_frame(np.random.default_rng(1), 10)
+    with_crashes = frame.assign(terrain=[*range(8), np.nan, np.nan])
+    first, second = (
+        collect_evidence(rows, REQUIREMENT, INDEPENDENT, has_own_terrains=False) for rows in (frame, with_crashes)
+    )
+    assert first is not None
+    assert second is not None
+    # ten terrains of the first confirmation, and two unknown ones of the second
+    assert first.join(second).population.terrains == 12
+
+
 def test_later_confirmations_use_the_sequential_test() -> None:
     """The first look keeps the ordinary bounds; the same cases after an earlier look need more evidence."""
     frame = make_frame(np.random.default_rng(1), 22)

@@ -7,18 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.nightly import (
-    FINISHED,
-    INTERRUPTED,
-    RUNNING,
-    History,
-    MetricChange,
-    NightCampaign,
-    NightComparison,
-    find_changes,
-    format_night_page,
-    list_comparisons,
-)
+from marsyard.reports.night_history import FINISHED, INTERRUPTED, RUNNING, History, MetricChange, NightCampaign
+from marsyard.reports.nightly import NightComparison, find_changes, format_night_page, list_comparisons
 from marsyard.reports.statistics.difference_tests import Metric, Sample
 
 N_CASES, N_TERRAINS = 100, 12

@@ -45,6 +45,11 @@ def _make_finder(make_run: MakeRun, frame: pd.DataFrame, *requirements: Mapping[
     return CaseFinder(evaluation.run, evaluation.verdicts)
 
 
+def test_rows_without_numbers_have_no_listed_violations(make_run: MakeRun) -> None:
+    finder = _make_finder(make_run, make_rows(30, answer_rate=0.5).drop(columns="case"), AVAILABLE)
+    assert finder.violating_cases == finder.worst_violations(2) == finder.violations("A") == []
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -26,7 +26,13 @@ from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustne
 from marsyard.reports.robustness_evaluation import evaluate_robustness
 from marsyard.reports.robustness_wording import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.statistics.reweighted_rates import Crossing, find_crossing, population_divergence, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import (
+    Crossing,
+    WeightedRates,
+    find_crossing,
+    population_divergence,
+    weighted_rates,
+)
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import number
@@ -165,6 +171,15 @@ def test_unobserved_value_is_no_evidence() -> None:
     weights = np.outer(1.0 - steps, np.ones(400))
     rates = weighted_rates(weights, np.zeros(400, dtype=np.bool_), None, (0.9, 0.9), 1.0 + 9.0 * steps)
     assert find_crossing(steps, rates, 0.05).lower == pytest.approx(0.435, abs=0.02)
+
+
+@pytest.mark.parametrize(("probability", "rate"), [(0.9, 0.1), (0.95, 0.05)])
+def test_rate_that_equals_the_permitted_one_is_met_without_a_change(probability: float, rate: float) -> None:
+    """The binary number 1 - 0.9 is below 0.1, and 1 - 0.95 is above 0.05."""
+    estimate, sizes = np.array([rate, 2.0 * rate]), np.array([0.0, 1.0])
+    rates = WeightedRates(estimate, estimate - 0.01, estimate + 0.01, np.full(2, 100.0))
+    assert find_crossing(sizes, rates, 1.0 - probability, decides_by_rate=True).lower == pytest.approx(0.0, abs=1e-12)
+    assert math.isnan(find_crossing(sizes, rates, 1.0 - probability).lower)
 
 
 def test_divergence_of_all_dispersions() -> None:

@@ -78,14 +78,14 @@ def test_condition_bins_have_correct_error_statistics() -> None:
         np.testing.assert_array_equal(np.sum([is_in_bin for _, is_in_bin in bins], axis=0), 1)
     section = conditions_section(make_subject(frame))
     bins = section.data["attitude_rate_max_deg_s"]
-    assert [entry["answered"]["n"] for entry in bins] == [200] * 5
-    assert [entry["means"][0] for entry in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
-    assert [entry["sds"][1] for entry in bins] == pytest.approx([2.0] * 5, rel=0.2)
+    assert [entry.answered.n for entry in bins] == [200] * 5
+    assert [entry.means[0] for entry in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
+    assert [entry.sds[1] for entry in bins] == pytest.approx([2.0] * 5, rel=0.2)
     # A bound of the 99 % quantile at 90 % confidence needs 230 answers: a bin has 180, a site 450.
-    assert bins[0]["quantile_bound"] == np.inf
+    assert bins[0].quantile_bound == np.inf
     site_bin = section.data["site"][0]
     valid = frame[frame["answered"] & frame["site"].eq("a")]
-    assert np.quantile(valid[METRIC], 0.99) < site_bin["quantile_bound"] <= site_bin["largest"]
+    assert np.quantile(valid[METRIC], 0.99) < site_bin.quantile_bound <= site_bin.largest
 
 
 def test_constant_conditions_are_omitted() -> None:
@@ -106,13 +106,13 @@ def test_variance_between_terrains_is_estimated() -> None:
     frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
     variance = terrain_variance(frame, METRIC)
     assert variance is not None
-    assert variance["fraction"] == pytest.approx(4.0 / 13.0, abs=0.1)
-    assert variance["within_sd"] == pytest.approx(3.0, rel=0.08)
-    assert variance["between_sd"] == pytest.approx(2.0, rel=0.2)
-    assert variance["p_value"] < 1e-6
+    assert variance.fraction == pytest.approx(4.0 / 13.0, abs=0.1)
+    assert variance.within_sd == pytest.approx(3.0, rel=0.08)
+    assert variance.between_sd == pytest.approx(2.0, rel=0.2)
+    assert variance.p_value < 1e-6
     variance_without_effect = terrain_variance(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
     assert variance_without_effect is not None
-    assert variance_without_effect["p_value"] > 0.01
+    assert variance_without_effect.p_value > 0.01
     assert terrain_variance(frame.assign(terrain=np.arange(1000)), METRIC) is None
     assert terrain_variance(frame.drop(columns="terrain"), METRIC) is None
 

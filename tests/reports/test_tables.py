@@ -18,7 +18,7 @@ from marsyard.reports.column_selection import axis_columns, category_column, dri
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.effects import correlation_text, estimate_effects
 from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS
-from marsyard.reports.hda.sites_section import distance_grid
+from marsyard.reports.hda.sites_section import HazardDistances, distance_grid
 from marsyard.reports.page import driver_figures, outcome_grid
 from marsyard.reports.populations import outcome_counts
 from marsyard.reports.rates import fraction_of
@@ -239,7 +239,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool)
 
 def test_bound_without_enough_cases_is_a_dash() -> None:
     # a lower bound of the 5 % quantile at 90 % confidence needs 45 values: 0.95^45 = 0.0994
-    (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
+    (row,) = distance_grid({"sites": HazardDistances(np.array([1.0, 2.0, 3.0]), None)}).rows
     assert row[-1] == NOTHING
 
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from marsyard.sim import kernel_cache
-from marsyard.sim.cache import GIGA, evict_files, limit_bytes, touch
+from marsyard.sim.cache import GIGA, cache_directory, evict_files, limit_bytes, touch
 from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
 
@@ -58,6 +58,13 @@ def test_old_partial_files_are_removed(folder: Path) -> None:
         os.utime(path, (time.time() - 3600.0 * age_h,) * 2)
     evict_files(folder, 0)
     assert _list_files(folder) == {"0", "1", "2", "3", "4", "new.part"}
+
+
+def test_empty_variables_select_the_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in (("MARSYARD_CACHE", ""), ("XDG_CACHE_HOME", ""), ("HOME", str(tmp_path / "home"))):
+        monkeypatch.setenv(name, value)
+    assert cache_directory("terrain") == tmp_path / "home" / ".cache" / "marsyard" / "terrain"
 
 
 def test_default_limit_is_a_fraction_of_available_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,6 +55,10 @@ def test_quaternion_products_match_rotations() -> None:
     assert_allclose(product.as_matrix(), (left * right).as_matrix(), atol=1e-14)
 
 
+def test_no_quaternions_accumulate_to_none() -> None:
+    assert accumulate_quaternions(np.empty((0, 4))).shape == (0, 4)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
 def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
     steps = Rotation.random(count, rng=count)

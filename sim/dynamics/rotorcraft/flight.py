@@ -35,10 +35,14 @@ class Vibration:
         amplitudes = np.repeat([parameters.acceleration_m_s2 / rate**2, np.radians(parameters.angle_deg)], 3)
         return cls(rate, amplitudes, 2.0 * np.pi * rng.random(6))
 
-    def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
-        """Compute the time derivative of the given order; order 0 is the displacement."""
-        phases = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
-        return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(phases))
+    def derivatives(
+        self, times_s: Float64[np.ndarray, "n"]
+    ) -> tuple[Float64[np.ndarray, "3 n 3"], Float64[np.ndarray, "3 n 3"]]:
+        """Compute displacement, rate and acceleration (first axis) of the positions, and of the angles."""
+        phases = self.rate_rad_s * times_s[:, None] + self.phases_rad
+        orders = [self.amplitudes * self.rate_rad_s**k * np.sin(phases + 0.5 * np.pi * k) for k in range(3)]
+        positions, angles = np.split(np.stack(orders), 2, axis=-1)
+        return positions, angles
 
 
 @dataclass(frozen=True)
@@ -72,10 +76,10 @@ class SimulatedPath(Trajectory):
         interval = np.clip(((times_s - self.start_s) / self.step_s).astype(int), 0, len(self.rows) - 2)
         elapsed_s = (times_s - self.start_s - self.step_s * interval)[:, None]
         angles, angle_rates, _ = self._interpolate(interval, elapsed_s, kernels.ANGLE)
-        vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
-        attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
+        shakes, (twist, twist_rate, _) = self.vibration.derivatives(times_s)
+        attitudes, rates = attitudes_and_body_rates(angles + twist, angle_rates + twist_rate)
         path = self._interpolate(interval, elapsed_s, kernels.POSITION)
-        derivatives = [vector + sine[:, :3] for vector, sine in zip(path, vibration, strict=True)]
+        derivatives = [vector + shake for vector, shake in zip(path, shakes, strict=True)]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _interpolate(
@@ -195,7 +199,7 @@ def simulate_transit(
     course = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
     profile = (distance, p.acceleration_m_s2 * elapsed_ramp, acceleration)
     reference = np.concatenate([np.multiply.outer(values, course) for values in profile], axis=1)
-    reference[:, :3] += first_image_position_m
+    reference[:, : kernels.VELOCITY] += first_image_position_m
     # start: hover, with the trim that balances the mean wind
     constants = craft.to_kernel(gravity_m_s2)
     trim = -air.mean_m_s / constants.drag_s
@@ -208,8 +212,8 @@ def simulate_transit(
     autopilot[kernels.THRUST] = np.sqrt(gravity_m_s2**2 + trim @ trim)
     autopilot[kernels.TRIM :] = trim
     rows = np.zeros((count, kernels.SIZE))
-    rows[0, kernels.POSITION :][:3] = reference[0, :3]
-    rows[0, kernels.ANGLE :][:3] = [heading_rad, pitch, roll]
+    rows[0, : kernels.VELOCITY] = reference[0, : kernels.VELOCITY]
+    rows[0, kernels.ANGLE : kernels.RATE] = [heading_rad, pitch, roll]
     flight = kernels.Flight(rows, autopilot, heading_rad, air.mean_m_s, air.gusts_m_s, step)
     kernels.follow_path(flight, reference, constants)
     path = SimulatedPath(-p.lead_s, step, rows, Vibration.draw(craft.vibration, rng), gravity_m_s2)
@@ -235,6 +239,7 @@ def simulate_landing(
     flight.
     """
     step, transit_knots = transit.craft.step_s, len(transit.path.rows)
+    start = transit_knots - 1
     count = transit_knots + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
     air.check_duration(count)
     if len(laser.noise_m) < count:
@@ -246,14 +251,14 @@ def simulate_landing(
         **guidance.model_dump(include=set(kernels.Landing._fields)),
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
-        hover_m=float(rows[transit_knots - 1, 2] + padded_errors[transit_knots - 1, 2]),
-        wait_until=transit_knots - 1 + round((guidance.wait_s - TAIL_S) / step),
+        hover_m=float(rows[start, kernels.POSITION + 2] + padded_errors[start, kernels.POSITION + 2]),
+        wait_until=start + round((guidance.wait_s - TAIL_S) / step),
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
     flight = kernels.Flight(rows, transit.autopilot.copy(), transit.heading_rad, air.mean_m_s, air.gusts_m_s, step)
     craft = transit.craft.to_kernel(transit.path.gravity_m_s2)
-    kernels.land(flight, phases, transit_knots - 1, padded_errors, laser.noise_m, ground, landing, craft)
+    kernels.land(flight, phases, start, padded_errors, laser.noise_m, ground, landing, craft)
     ground_knots = np.flatnonzero(phases == Phase.ON_GROUND.value)
     if end_s is not None:
         count = min(count, round((end_s - transit.path.start_s) / step) + 1)

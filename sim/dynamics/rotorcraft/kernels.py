@@ -137,7 +137,8 @@ def compute_laser_range(ground: GroundPatch, row: Array) -> float:
     north = -(math.sin(yaw) * forward + math.cos(yaw) * left)
     distance = 0.0
     for _ in range(4):
-        height = row[2] - compute_ground_height(ground, row[0] + distance * east, row[1] + distance * north)
+        x, y = row[POSITION] + distance * east, row[POSITION + 1] + distance * north
+        height = row[POSITION + 2] - compute_ground_height(ground, x, y)
         distance = height / down
     return distance
 
@@ -244,13 +245,15 @@ def _step_on_ground(row: Array, after: Array, step: float, craft: Craft) -> None
 
 @njit(cache=True)
 def follow_path(flight: Flight, path: Array, craft: Craft) -> None:
-    """Simulate a flight along a path (position, velocity, acceleration of each knot), controlled by true states."""
+    """Simulate a flight along a path, controlled by true states.
+
+    A row of `path` is the commanded position, velocity and acceleration at a knot, as in a row of the flight.
+    """
     no_error = np.zeros(3)
     for k in range(flight.rows.shape[0] - 1):
         delayed = flight.rows[max(k - craft.delay_steps, 0)]
-        command = _command_acceleration(
-            delayed, flight.autopilot, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, craft
-        )
+        position, velocity, acceleration = path[k, :VELOCITY], path[k, VELOCITY:ACCELERATION], path[k, ACCELERATION:]
+        command = _command_acceleration(delayed, flight.autopilot, position, velocity, acceleration, flight.step, craft)
         _step_flight(flight, k, no_error, command, craft)
 
 
@@ -306,7 +309,7 @@ def land(
             goal[2] = estimate[2]
         command = _command_acceleration(estimate, flight.autopilot, goal, velocity, zero, flight.step, craft)
         _step_flight(flight, k, errors[k, ACCELERATION:], command, craft)
-        after = rows[k + 1]
-        if phase != WAIT and after[2] - craft.gear_m <= compute_ground_height(ground, after[0], after[1]):
+        east, north, up = rows[k + 1, :VELOCITY]
+        if phase != WAIT and up - craft.gear_m <= compute_ground_height(ground, east, north):
             phase = REST
         phases[k + 1] = phase

@@ -1,9 +1,11 @@
 """Parameters of a helicopter with its autopilot, of the air, and of the two parts of its flight (landing paper, V)."""
 
+from __future__ import annotations
+
 import math
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics.rotorcraft import kernels
 from marsyard.sim.error_sources import VIBRATION, WIND
@@ -57,6 +59,14 @@ class RotorcraftParameters(Parameters):
     contact_s: Annotated[Positive, Field(le=1.0, description="time constant of the motion on the ground, s")] = 0.1
     step_s: Annotated[Positive, Field(le=0.05, description="step of the simulation")] = 0.02
     vibration: VibrationParameters = VibrationParameters()
+
+    @model_validator(mode="after")
+    def _check_step(self) -> RotorcraftParameters:
+        for name in ("drag_s", "contact_s"):
+            # at a longer step the simulated velocity oscillates and grows
+            if getattr(self, name) <= self.step_s:
+                raise ValueError(f"{name} is {getattr(self, name):g}; allowed: above step_s, {self.step_s:g}")
+        return self
 
     def to_kernel(self, gravity_m_s2: float) -> kernels.Craft:
         """Convert the parameters to SI units for the kernels."""

@@ -27,9 +27,10 @@ TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 
 #: First columns in a row of the tilt compass after the time tag: up direction (body axes), and yaw from the heading,
 #: counterclockwise from east.
 UP, YAW = 1, 4
-#: First indices in the filter's memory between runs: whether the last receiver solution was fixed (-1: no
-#: solution yet), filtered acceleration in world axes, and number of consecutive rejected solutions.
-LAST_FIX, FILTERED_ACCELERATION, REJECTED = 0, 1, 4
+#: First indices in the filter's memory between runs: whether the last receiver solution was fixed (or `NO_FIX`),
+#: filtered acceleration in world axes, and number of consecutive rejected solutions; number of values.
+LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
+NO_FIX = -1.0  #: Value of `LAST_FIX` before the first solution.
 
 
 class Tuning(NamedTuple):
@@ -267,12 +268,12 @@ def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tunin
     for i in range(3):
         h[:] = 0.0
         h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
-        residual = row[GPS_POSITION + i] + change[i] - state[POSITION + i]
+        residual = row[GPS_POSITION + i] + change[POSITION + i] - state[POSITION + i]
         all_accepted &= update_scalar(estimate, h, residual, row[GPS_NOISE + i], tuning.gate)
     for i in range(3):
         h[:] = 0.0
         h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
-        residual = row[GPS_VELOCITY + i] + change[3 + i] - state[VELOCITY + i]
+        residual = row[GPS_VELOCITY + i] + change[VELOCITY + i] - state[VELOCITY + i]
         all_accepted &= update_scalar(estimate, h, residual, tuning.velocity_noise_m_s[i], tuning.gate)
     return all_accepted
 
@@ -330,8 +331,8 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
     """
     times, gps, compass = inputs.times, inputs.gps, inputs.compass
     states = np.empty((times.size, STATE))
-    # position and velocity change since the start of the run, from the inertial unit only
-    inertial = np.zeros((times.size, 6))
+    # position and velocity change since the start of the run, from the inertial unit only, in the columns of a state
+    inertial = np.zeros((times.size, QUATERNION))
     next_fix = next_reading = 0
     states[0] = start
     for k in range(times.size):
@@ -340,8 +341,9 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
         if k > 0:
             _propagate(inputs, k, states, p, memory, tuning)
             change = state[VELOCITY : VELOCITY + 3] - states[k - 1, VELOCITY : VELOCITY + 3]
-            inertial[k, :3] = inertial[k - 1, :3] + (inertial[k - 1, 3:] + 0.5 * change) * inputs.step
-            inertial[k, 3:] = inertial[k - 1, 3:] + change
+            before = inertial[k - 1]
+            inertial[k, :VELOCITY] = before[:VELOCITY] + (before[VELOCITY:] + 0.5 * change) * inputs.step
+            inertial[k, VELOCITY:] = before[VELOCITY:] + change
         while next_fix < gps.shape[0] and gps[next_fix, DELIVERY] <= times[k]:
             row = gps[next_fix]
             next_fix += 1
@@ -352,7 +354,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
                 memory[LAST_FIX] = row[FIXED]
             # displacement since the time of the solution, from the current velocity estimate
             fix_change = inertial[k] - _interpolate(times, inertial, k, row[TAG])
-            fix_change[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
+            fix_change[:VELOCITY] += (state[VELOCITY:QUATERNION] - inertial[k, VELOCITY:]) * (times[k] - row[TAG])
             if memory[REJECTED] >= tuning.max_rejected_fixes:
                 _restart(estimate, row, tuning)
             is_accepted = update_fix(row, estimate, fix_change, times[k], tuning)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, expose_strata
+from marsyard.sim.terrain.landforms.kernels.bedrock import LOG_ALBEDO, Slabs, add_slabs, expose_strata
 from marsyard.sim.terrain.landforms.random_fields import draw_smooth_fields
 
 _ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.
@@ -19,9 +19,9 @@ _SIZES, _HEIGHTS = (1.0, 0.37), (1.0, 0.4)
 #: boundary into a patch, in heights per standard deviation of the field (assumed).
 _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
-#: the joints in sizes; height above the sand over which dust covers a slab, in heights; fraction of the large slabs
-#: that the second generation divides (assumed).
-_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.35, 0.6
+#: the joints, and length of their bends, in sizes; height above the sand over which dust covers a slab, in heights;
+#: fraction of the large slabs that the second generation divides (assumed).
+_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.6, 0.35, 0.6
 
 
 class Strata(Parameters):
@@ -82,9 +82,9 @@ class Outcrop(Parameters):
         """Add the slabs of both generations."""
         layer = ground.coarser(0.5 * self.joint_m)
         patches = draw_smooth_fields(ground.period_m, self.patch_m, self.patch_m, 0.0, rng)
-        sand_m = _SAND_LENGTH * self.slab_m
+        sand_m, bend_m = _SAND_LENGTH * self.slab_m, _BEND_LENGTH * self.slab_m
         sand = draw_smooth_fields(ground.period_m, sand_m, sand_m, 0.0, rng)[..., 0]
-        bends = _DISPLACEMENT * self.slab_m * draw_smooth_fields(ground.period_m, *(0.6 * self.slab_m,) * 2, 0.0, rng)
+        bends = _DISPLACEMENT * self.slab_m * draw_smooth_fields(ground.period_m, bend_m, bend_m, 0.0, rng)
         rows = min(len(bends), layer.side)
         patch, tone, sand, bend_x, bend_y = (
             resample(np.ascontiguousarray(field), rows)
@@ -98,7 +98,7 @@ class Outcrop(Parameters):
             self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
             for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
-        generations[0].slabs[..., 3] += self.log_albedo
+        generations[0].slabs[..., LOG_ALBEDO] += self.log_albedo
         fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
         edge = max(_DUSTY_EDGE * self.height_m, 1e-6)
         add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, _FRACTURED, edge)
@@ -106,6 +106,7 @@ class Outcrop(Parameters):
 
     def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
         """Draw the slabs of a generation with this size and height relative to the parameters."""
+        # a Voronoi cell needs neighbours on all sides
         cells = max(round(period_m / (size * self.slab_m)), 3)
         rise = _HEIGHT_RANGE * height * self.height_m
         slabs = np.stack(

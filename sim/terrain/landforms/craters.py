@@ -1,4 +1,4 @@
-"""Impact craters: their sizes, ages and outlines, and the sand in them."""
+"""Impact craters: their sizes, ages and outlines, and the brightness of their ejecta and of the sand in them."""
 
 from __future__ import annotations
 
@@ -102,41 +102,43 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> np.ndarray:
     # spread of sand and of its asymmetry between craters (assumed)
     fill_radius = rng.uniform(SMALLEST_FILL, LARGEST_FILL, count)
     lee = 0.3 * rng.standard_normal((count, 2))
-    outline = rng.integers(0, OUTLINES, count)
-    rotation = rng.uniform(0.0, 1.0, count)
-    wear = [np.full(count, value) for value in (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)]
+    craters = np.zeros(count, dtype=CRATER)
+    craters["radius"], craters["depth"], craters["rim"], craters["rounding"] = diameter / 2.0, depth, rim, rounding
+    craters["fill"], craters["fill_radius"], craters["fill_log_albedo"] = fill, fill_radius, fill_log_albedo
+    craters["lee_x"], craters["lee_y"] = lee.T
+    craters["outline"] = rng.integers(0, OUTLINES, count)
+    craters["rotation"] = rng.uniform(0.0, 1.0, count)
+    craters["ejecta_log_albedo"] = ejecta_log_albedo
+    craters["extent"], craters["opacity"], craters["margin"] = EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN
     if p.craters_wear_albedo:
-        fill += MIN_FILL * (1.0 - fill)
-        ejecta_log_albedo = np.abs(ejecta_log_albedo)
-        fill_log_albedo, fill_radius, *wear = _draw_worn_albedo(p, diameter, freshness, rng)
+        _wear_albedo(craters, p, freshness, rng)
         _gather_secondaries(position, diameter, period, rng)
-    shape = (position, diameter / 2.0, depth, rim, rounding, fill)
-    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius, lee)
-    return np.column_stack([*shape, *albedo, outline, rotation, *wear]).view(CRATER)[:, 0]
+    craters["x"], craters["y"] = position.T
+    return craters
 
 
-def _draw_worn_albedo(
-    p: TerrainParameters,
-    diameter: Float64[np.ndarray, "craters"],
-    freshness: Float64[np.ndarray, "craters"],
-    rng: Generator,
-) -> tuple[Float64[np.ndarray, "craters"], ...]:
-    """Draw the columns of `stamp_craters` that depend on the age: log albedo and radius of the fill, and the last four.
+def _wear_albedo(
+    craters: np.ndarray, p: TerrainParameters, freshness: Float64[np.ndarray, "craters"], rng: Generator
+) -> None:
+    """Make fill and ejecta of craters, a table of type `CRATER`, depend on their age, in place.
 
     A deep bowl shelters more sand than a shallow one. Ejecta are mixed into the soil as the rim wears, and the border
     of the fill becomes gradual. Large craters have a deposit of dust in their middle. All laws are assumed.
     """
-    count, size_factor = diameter.size, np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    count, diameter = len(craters), 2.0 * craters["radius"]
+    size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    craters["fill"] += MIN_FILL * (1.0 - craters["fill"])
+    craters["ejecta_log_albedo"] = np.abs(craters["ejecta_log_albedo"])
     has_sand = rng.uniform(size=count) < p.crater_sand_fraction
     supply = size_factor**0.7 * np.minimum(np.sqrt(2.0 * FULL_CONTRAST_M / diameter), 1.0)
     fill_log_albedo = p.crater_sand_log_albedo * has_sand * supply * freshness * rng.uniform(0.7, 1.3, count)
-    fill_log_albedo += p.crater_floor_contrast * size_factor * rng.standard_normal(count)
-    extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
-    opacity = EJECTA_OPACITY * freshness**1.5
+    craters["fill_log_albedo"] = fill_log_albedo + p.crater_floor_contrast * size_factor * rng.standard_normal(count)
+    craters["extent"] = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
+    craters["opacity"] = EJECTA_OPACITY * freshness**1.5
     margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
-    margin = np.minimum(2.0 * margin_m / diameter, 0.5)
-    core = size_factor * rng.uniform(0.3, 1.0, count)
-    return fill_log_albedo, 1.0 + 0.2 * margin, extent, opacity, margin, core
+    craters["margin"] = np.minimum(2.0 * margin_m / diameter, 0.5)
+    craters["fill_radius"] = 1.0 + 0.2 * craters["margin"]
+    craters["core"] = size_factor * rng.uniform(0.3, 1.0, count)
 
 
 def _gather_secondaries(

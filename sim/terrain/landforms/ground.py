@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from marsyard.sim.terrain.landforms.kernels.shapes import add_refined
+from marsyard.sim.terrain.kernels import add_refined
 
 SMALLEST_SIDE = 16  #: Minimum side of the grid of a landform, samples.
 Grid = Float32[np.ndarray, "side side"]

@@ -9,8 +9,8 @@ import scipy.fft
 from jaxtyping import Complex64, Float32, Float64, Inexact
 from numpy.random import Generator
 
+from marsyard.sim.terrain.kernels import add_refined
 from marsyard.sim.terrain.landforms.ground import SMALLEST_SIDE, Grid, refine
-from marsyard.sim.terrain.landforms.kernels.shapes import add_refined
 
 #: Maximum side of the grid of a smooth field, samples; it limits time and memory of the Fourier transform.
 MAX_SMOOTH_SIDE = 2048

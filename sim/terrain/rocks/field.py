@@ -26,6 +26,7 @@ from marsyard.sim.terrain.surface import ROCKS, Surface
 MAX_ROCKS = 2_000_000  #: Maximum number of rocks on one terrain.
 CELL_OVER_DIAMETER = 3.0  #: Side of the cells of the neighbour search, divided by the mean diameter.
 MAX_TRIES = 20000  #: Maximum number of random positions that are tried for a rock.
+_INTERVALS = 2000  #: Intervals of the diameter over which the number of rocks is integrated.
 #: Arrays of a `RockField` with one row per rock.
 ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
 Positions = Float64[np.ndarray, "selected 3"]
@@ -121,7 +122,8 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -
         return np.asarray(p.abundance * q * np.exp(-q * d) / (np.pi * d / 4.0))
 
     # cumulative number of rocks per square metre up to each diameter, by Simpson's rule in the logarithm of diameter
-    diameter, step = np.geomspace(p.smallest_m, p.largest_m, 2001), np.log(p.largest_m / p.smallest_m) / 2000
+    diameter = np.geomspace(p.smallest_m, p.largest_m, _INTERVALS + 1)
+    step = np.log(p.largest_m / p.smallest_m) / _INTERVALS
     middle = np.sqrt(diameter[1:] * diameter[:-1])
     interval_counts = (
         step / 6.0 * (density_per_log(diameter[:-1]) + 4.0 * density_per_log(middle) + density_per_log(diameter[1:]))
@@ -217,12 +219,12 @@ class RockField:
         yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, random_diameter.size)])
         radius = rock_shapes(shapes.COARSEST).max_radius[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
-        ground = surface.evaluate(xy[:, 0], xy[:, 1])
-        position = np.column_stack([xy, ground[:, 0]])
+        ground_m, slope_x, slope_y, _ = surface.evaluate(xy[:, 0], xy[:, 1]).T
+        position = np.column_stack([xy, ground_m])
         # normal of the ground, averaged over about the size of the rock
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
         up = np.ones((diameter.size, 3))
-        up[:, :2] = -ground[:, 1:3]
+        up[:, :2] = -np.column_stack([slope_x, slope_y])
         for number in np.unique(level[level > 0]):
             has_level = level == number
             up[has_level, :2] = -surface.gradient(xy[has_level, 0], xy[has_level, 1], int(number))

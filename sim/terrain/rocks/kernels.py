@@ -21,6 +21,66 @@ class Placements(NamedTuple):
     up: Array
 
 
+class DiscGrid(NamedTuple):
+    """Discs on a periodic square, with a linked list of the discs that touch each cell of a grid.
+
+    - discs: rows (x, y, radius)
+    - first_entry: first entry of each cell's list, shape (side, side), rows along y; -1 at the end of a list
+    - next_entry, disc_of_entry: next entry of the list, and number of the disc, of each entry
+    - period, cell: side of the square and of a cell, metres
+    """
+
+    discs: Array
+    first_entry: Ints
+    next_entry: Ints
+    disc_of_entry: Ints
+    period: float
+    cell: float
+
+
+@njit(cache=True, inline="always")
+def _touched_cells(grid: DiscGrid, centre: float, radius: float) -> tuple[int, int]:
+    """Return the first cell along one axis that a disc touches, not within the period, and the number of cells."""
+    side = grid.first_entry.shape[0]
+    first = int((centre - radius) / grid.cell + side)
+    return first, min(int((centre + radius) / grid.cell + side) - first + 1, side)
+
+
+@njit(cache=True)
+def _is_free(grid: DiscGrid, x: float, y: float, radius: float) -> bool:
+    """Return whether a disc overlaps no listed disc."""
+    side, period = grid.first_entry.shape[0], grid.period
+    first_row, rows = _touched_cells(grid, y, radius)
+    first_column, columns = _touched_cells(grid, x, radius)
+    for i in range(first_row, first_row + rows):
+        for j in range(first_column, first_column + columns):
+            entry = grid.first_entry[i % side, j % side]
+            while entry >= 0:
+                other = grid.discs[grid.disc_of_entry[entry]]
+                dx, dy = abs(other[0] - x), abs(other[1] - y)
+                dx, dy = min(dx, period - dx), min(dy, period - dy)
+                min_distance = other[2] + radius
+                if dx * dx + dy * dy < min_distance * min_distance:
+                    return False
+                entry = grid.next_entry[entry]
+    return True
+
+
+@njit(cache=True)
+def _list_disc(grid: DiscGrid, disc: int, entries: int) -> int:
+    """List a disc in the cells that it touches, after `entries` existing entries; return their new number."""
+    side = grid.first_entry.shape[0]
+    x, y, radius = grid.discs[disc]
+    first_row, rows = _touched_cells(grid, y, radius)
+    first_column, columns = _touched_cells(grid, x, radius)
+    for i in range(first_row, first_row + rows):
+        for j in range(first_column, first_column + columns):
+            grid.disc_of_entry[entries], grid.next_entry[entries] = disc, grid.first_entry[i % side, j % side]
+            grid.first_entry[i % side, j % side] = entries
+            entries += 1
+    return entries
+
+
 @njit(cache=True)
 def place_discs(
     radii: Array,
@@ -35,72 +95,40 @@ def place_discs(
 
     Discs are placed in order, the largest first, each at the first of its random positions that is free (rejection
     sampling). `occupied` has rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc
-    without a free position after `max_tries` gets NaN. Neighbours are found in a grid of cells; each cell has a linked
-    list of the discs that touch it.
+    without a free position after `max_tries` gets NaN. `cell_m` is the approximate side of the cells of the search.
     """
     rows, max_density = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
     cell = period / side
-    n_entries = 0
+    max_entries = 0
     for radius in np.concatenate((radii, occupied[:, 2])):
-        cells_across = min(int(2.0 * radius / cell) + 2, side)
-        n_entries += cells_across * cells_across
-    first_entry = np.full(side * side, -1, dtype=np.int32)
-    next_entry = np.empty(n_entries, dtype=np.int32)
-    disc_of_entry = np.empty(n_entries, dtype=np.int32)
-    discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
-    positions = np.full((radii.size, 2), np.nan, dtype=np.float64)
-    n_listed, n_discs = 0, 0
-    for disc in range(occupied.shape[0] + radii.size):
-        is_existing = disc < occupied.shape[0]
-        radius = occupied[disc, 2] if is_existing else radii[disc - occupied.shape[0]]
-        x, y = 0.0, 0.0
-        is_free = is_existing
-        if is_existing:
-            x, y = occupied[disc, 0] % period, occupied[disc, 1] % period
-        tries = 0
-        while not is_free and tries < max_tries:
-            tries += 1
-            x, y, is_free = rng.random() * period, rng.random() * period, True
+        max_entries += min(int(2.0 * radius / cell) + 2, side) ** 2
+    grid = DiscGrid(
+        np.empty((occupied.shape[0] + radii.size, 3)),
+        np.full((side, side), -1, dtype=np.int32),
+        np.empty(max_entries, dtype=np.int32),
+        np.empty(max_entries, dtype=np.int32),
+        period,
+        cell,
+    )
+    discs, entries = occupied.shape[0], 0
+    grid.discs[:discs] = occupied
+    for disc in range(discs):
+        grid.discs[disc, 0], grid.discs[disc, 1] = occupied[disc, 0] % period, occupied[disc, 1] % period
+        entries = _list_disc(grid, disc, entries)
+    positions = np.full((radii.size, 2), np.nan)
+    for n in range(radii.size):
+        for _ in range(max_tries):
+            x, y = rng.random() * period, rng.random() * period
             i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
             if rows > 1 and rng.random() * max_density > density[i, j]:
-                is_free = False
                 continue
-            cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
-            cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
-            for di in range(cell_rows):
-                i = (int((y - radius) / cell + side) + di) % side
-                for dj in range(cell_columns):
-                    j = (int((x - radius) / cell + side) + dj) % side
-                    entry = first_entry[i * side + j]
-                    while entry >= 0:
-                        other = disc_of_entry[entry]
-                        dx, dy = abs(discs[other, 0] - x), abs(discs[other, 1] - y)
-                        dx, dy = min(dx, period - dx), min(dy, period - dy)
-                        min_distance = discs[other, 2] + radius
-                        if dx * dx + dy * dy < min_distance * min_distance:
-                            is_free = False
-                            break
-                        entry = next_entry[entry]
-                    if not is_free:
-                        break
-                if not is_free:
-                    break
-        if not is_free:
-            continue
-        if not is_existing:
-            positions[disc - occupied.shape[0], 0], positions[disc - occupied.shape[0], 1] = x, y
-        discs[n_discs, 0], discs[n_discs, 1], discs[n_discs, 2] = x, y, radius
-        cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
-        cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
-        for di in range(cell_rows):
-            i = (int((y - radius) / cell + side) + di) % side
-            for dj in range(cell_columns):
-                j = (int((x - radius) / cell + side) + dj) % side
-                disc_of_entry[n_listed], next_entry[n_listed] = n_discs, first_entry[i * side + j]
-                first_entry[i * side + j] = n_listed
-                n_listed += 1
-        n_discs += 1
+            if _is_free(grid, x, y, radii[n]):
+                positions[n, 0], positions[n, 1] = x, y
+                grid.discs[discs, 0], grid.discs[discs, 1], grid.discs[discs, 2] = x, y, radii[n]
+                entries = _list_disc(grid, discs, entries)
+                discs += 1
+                break
     return positions
 
 

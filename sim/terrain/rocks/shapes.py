@@ -276,7 +276,8 @@ class _RockShape:
             surface_function(surface_points + offset) - surface_function(surface_points - offset)
             for offset in step * np.eye(3)
         ]
-        gradient = np.stack(differences, axis=1) / (2.0 * step) / (self.axes * self.frame[1])
+        _, stretch = self.frame
+        gradient = np.stack(differences, axis=1) / (2.0 * step) / (self.axes * stretch)
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def radius(self, d: Points) -> Float64[np.ndarray, "n"]:
@@ -311,6 +312,7 @@ class _RockShape:
         filled = float(np.quantile(outline, _FILLED_OUTLINE))
         ground = min(max(ground, filled), lowest + MAX_BURIED_FRACTION * (highest - lowest))
         visible = points[points[:, 2] >= ground, :2]
+        # diameters in steps of one degree
         azimuth = np.linspace(0.0, np.pi, 180, endpoint=False)
         projections = visible[:, :1] * np.cos(azimuth) + visible[:, 1:] * np.sin(azimuth)
         diameters = np.ptp(projections, axis=0)

@@ -9,6 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.claims import bank_seeds
+from marsyard.campaigns.definition.components import list_algorithms
 from marsyard.campaigns.definition.identity import hash_code
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
@@ -54,7 +57,10 @@ INVALID = {
         ("altitude_m = {distribution='uniform', low=nan, high=1}", "altitude_m.low: input should be a finite number"),
         ("altitude_m = {distribution='uniform', low=true, high=1}", "altitude_m.low: input should be a valid number"),
         ("altitude_m = {distribution='normal', mean=5, sd=0}", "altitude_m.sd: input should be greater than 0"),
-        ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}", "the first limit must be below"),
+        (
+            "altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}",
+            "truncate = [9.0, 8.0]: the first limit must be below",
+        ),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[90,95]}", "no probability between the limits"),
         ("altitude_m = {distribution='normal', mean=500, sd=100}", "which is not valid: altitude_m"),
         ("altitude_m = {distribution='cauchy', loc=2000}", "which is not valid"),
@@ -310,3 +316,31 @@ def test_hash_of_the_code_includes_the_shaders(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("marsyard.campaigns.definition.identity.hash_sources", lambda sources: sorted(dict(sources)))
     names = hash_code.__wrapped__(())
     assert {"sim/render/pinhole.py", "sim/render/shaders/segmentation.vert"} <= set(names)
+
+
+@pytest.mark.parametrize(
+    ("campaign", "path", "value"),
+    [
+        ("dimes-smoke", "algorithm", "custom:Estimator"),
+        ("dimes-smoke", "compared", ["custom:Estimator"]),
+        ("dimes-smoke", "compared.0", "custom:Estimator"),
+        ("vtt-sideways", "drive", {"algorithm": "custom:Estimator"}),
+        ("vtt-sideways", "drive", {"compared": ["custom:Estimator"]}),
+    ],
+)
+def test_algorithms_in_dispersions_are_listed(campaign: str, path: str, value: object) -> None:
+    """Otherwise the code of a folder from elsewhere would be executed without --trust, and would have no hash."""
+    tables = load_campaign(campaign).definition.model_dump(mode="json")
+    tables |= {"correlations": [], "dispersions": {path: {"distribution": "choice", "values": [value]}}}
+    assert list_algorithms(CampaignDefinition.model_validate(tables))[-1] == "custom:Estimator"
+
+
+@pytest.mark.parametrize("path", ["location.bank_seed", "location"])
+def test_dispersed_seed_of_a_terrain_bank_is_not_derived(path: str) -> None:
+    """The command of a confirmation sets derived seeds, which removes their dispersions."""
+    definition = load_campaign("dimes-smoke").definition
+    assert set(bank_seeds(definition)) == {"location.bank_seed"}
+    value = {"bank_seed": 5} if path == "location" else 5
+    tables = definition.model_dump(mode="json")
+    tables |= {"correlations": [], "dispersions": {path: {"distribution": "fixed", "value": value}}}
+    assert bank_seeds(CampaignDefinition.model_validate(tables)) == {}

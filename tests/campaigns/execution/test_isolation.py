@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.cases import make_unfinished_row
+from marsyard.campaigns.execution.case_rows import make_unfinished_row
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 
+from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import CampaignError, DefinitionError, StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.execution.workers import LocalExecutor
@@ -24,6 +25,20 @@ from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_cas
 
 #: Value of a key that the record does not have.
 REMOVED = object()
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        5,
+        {"kind": "unknown"},
+        {"kind": "confirmation", "overlap": "much"},
+        {"kind": "confirmation", "number": []},
+        {"kind": "calibration", "changes": 5},
+    ],
+)
+def test_invalid_evidence_in_a_record_is_an_exploration(entry: object) -> None:
+    assert Evidence.read(entry) == Evidence()
 
 
 def test_run_killed_at_its_start_can_be_restarted(

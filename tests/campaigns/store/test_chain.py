@@ -11,6 +11,7 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import chain
+from marsyard.campaigns.store.key import is_signature, sign
 from marsyard.campaigns.store.rows import Row, RowStore, create_store
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.command import run_command
@@ -234,3 +235,10 @@ def test_chain_continues_over_resume_and_append(tmp_path: Path, watch: Recording
         store.verify()
         # 12 cases, one repeated case and 3 appended cases
         assert (first[0], store._last_entry()[0], store.count()) == (12, 16, 15)
+
+
+def test_any_text_can_be_checked_as_a_signature(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A record from elsewhere can contain any JSON text, such as a lone surrogate."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert is_signature(sign(b"content"), b"content")
+    assert not is_signature("\ud800", b"content")

@@ -15,9 +15,10 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.sampling.study_points import NEW_STREAM, POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
+from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
 from marsyard.campaigns.studies.results import SearchParameters
 from marsyard.campaigns.studies.runner import prepare_campaign
-from marsyard.campaigns.studies.search import start_search, write_regression_campaigns
+from marsyard.campaigns.studies.search import start_search
 from marsyard.scenarios.systems import systems
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign
 
@@ -110,6 +111,23 @@ def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:
     assert tomllib.loads(path.read_text())["parameters"]["terrain"] == failure.values["terrain"]
 
 
+def test_regression_campaign_has_the_fixed_and_derived_values_of_the_violation(tmp_path: Path) -> None:
+    other = """
+        "wind.north_m_s" = {distribution = "fixed", value = 7.0}
+        "wind.east_m_s" = {distribution = "derived", formula = "0.01 * altitude_m"}
+    """
+    dispersions, requirement = DISPERSIONS.replace("HIGH", "99_999") + other, REQUIREMENT.replace("5.0", "0.5")
+    campaign = load_campaign(str(write_campaign(tmp_path, dispersions=dispersions, requirement=requirement)))
+    parameters = SearchParameters("velocity", cases=20, restarts=1, max_failures=1)
+    result = start_search(campaign, parameters, 500, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    (failure,) = result.failures
+    row = next(row for row in read_case_rows(tmp_path / "run") if row["case"] == failure.case)
+    (path,) = write_regression_campaigns(campaign, result, tmp_path / "run")
+    wind = tomllib.loads(path.read_text())["parameters"]["wind"]
+    assert (wind["north_m_s"], wind["east_m_s"]) == (7.0, row["wind.east_m_s"])
+    assert row["wind.east_m_s"] != campaign.definition.parameters["wind"]["east_m_s"]
+
+
 def test_numbers_that_repeat_within_the_study_are_rejected(tmp_path: Path) -> None:
     campaign = load_fake_campaign(tmp_path, 9)
     assert prepare_campaign(campaign, 10).drawn_paths == ("altitude_m",)
@@ -142,6 +160,12 @@ def test_each_system_has_requirements_with_margins_and_error_sources(system: str
         n_with_margin += any(item.bound is not None or item.margin is not None for item in requirements)
         assert len(active_sources(campaign)[0]) >= 3, name  # error sources that have an effect in this campaign
     assert n_with_margin >= 1
+
+
+@pytest.mark.parametrize(("name", "sources"), [("dimes-offnominal", {"optics", "clouds"}), ("hda-limits", {"motion"})])
+def test_error_source_in_a_dispersed_table_is_active(name: str, sources: set[str]) -> None:
+    """The table (`faults`, `image_poses`) is drawn as a whole; in the campaign's parameters the source does not act."""
+    assert sources <= {source.name for source in active_sources(load_campaign(name))[0]}
 
 
 @pytest.mark.slow

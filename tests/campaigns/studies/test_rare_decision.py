@@ -104,6 +104,8 @@ def test_replicate_that_stopped_early_gives_no_estimate(end: SubsetEnd, text: st
     assert (decision.interval.lower, decision.interval.upper) == (0.0, 1.0)
     needed = find_units_needed(0, 1e-2, NOMINAL_RISK)
     assert decide_rare(create_sample([*SMOOTH, early], 0, needed), 1e-2, 0.9).verdict is RareVerdict.PASS
+    # 4e10 cases would be needed, more than any campaign can have
+    assert decide_rare(create_sample([*SMOOTH, early], 0, 2000), 1e-10, 0.9).additional_random_cases is None
 
 
 def test_violations_without_intermediate_margins_refute_the_estimate() -> None:

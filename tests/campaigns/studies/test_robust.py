@@ -36,7 +36,7 @@ from marsyard.reports.robustness import ChangeOutcome
 from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
-from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain import Site
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
@@ -165,6 +165,15 @@ def test_bounds_of_variants_allow_for_shared_terrains_and_repeated_looks() -> No
     assert 0.0 < result.lower <= exact.min_failure_rate(0.03) * 1.001
 
 
+def test_variant_with_exactly_the_required_rate_is_met_by_rate() -> None:
+    """1 - 0.9 is a little less than 10 of 100."""
+    rows = pd.DataFrame({"case": np.arange(100), "outcome": "VALID", "answered": True, "ok": np.arange(100) >= 10})
+    verdict = Verdict("OK", "", "ok", math.nan, 0.9, 0.9, "all", decide_by=ESTIMATE)
+    result = _evaluate(RobustStudy([], rows, np.ones(100)), RobustVariant("v", "V", {}), rows, verdict)
+    assert result is not None
+    assert result.status is Status.MET_BY_RATE
+
+
 def test_steps_allow_for_shared_terrains() -> None:
     """Pairs of failures on 100 terrains widen the interval of the change, as they widen the bounds of a verdict."""
     margins = np.array([np.where(np.arange(300) < failures, -1.0, 1.0) for failures in (4, 40)])
@@ -267,6 +276,7 @@ def test_changed_rows_of_a_study_are_found(run: Path) -> None:
     [
         (("--parameter", "loads.0=3"), "is dispersed, so that the stored cases give its robustness"),
         (("--parameter", "betta=1"), "there is no parameter 'betta'"),
+        (("--parameter", "terrain=2.5"), "its value in the campaign is -1; allowed: whole numbers"),
         (("--parameter", "step=1"), "is False; allowed: parameters with a number"),
         (("--parameter", f"beta={BETA}"), "this is its value in the campaign"),
         (("--parameter", "beta=1", "-n", "20"), "--cases 20: at least 60"),
@@ -282,6 +292,17 @@ def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[st
     result = CliRunner().invoke(app, ["robust", str(finished_run), *arguments])
     assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
     assert not (finished_run / "robust").exists()
+
+
+def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
+    lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
+    table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'
+    lines.insert(lines.index("[dispersions]") + 1, table)
+    (tmp_path / "campaign.toml").write_text("\n".join(lines))
+    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
+    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    with pytest.raises(CampaignError, match=r"loads\.0 = .*: its table 'loads' is dispersed as a whole"):
+        study(tmp_path / "run", {"loads.0": 3.0})
 
 
 def test_invalid_value_of_a_variant_is_rejected(run: Path) -> None:

@@ -52,6 +52,18 @@ def test_planted_defect_is_found_and_reduced_to_its_two_causes(campaign_path: Pa
     assert replay(tmp_path / "run", result.failures[0].case).differing == ()
 
 
+def test_search_in_one_dispersion_uses_all_its_cases(tmp_path: Path) -> None:
+    other_dispersions = ('"loads.1" =', "kind =")
+    lines = [line for line in limit_state.CAMPAIGN.splitlines() if not line.startswith(other_dispersions)]
+    (tmp_path / "campaign.toml").write_text("\n".join(lines))
+    campaign = prepare_campaign(load_campaign(str(tmp_path / "campaign.toml"), ["beta=2"]), 5000)
+    study = SearchStudy(campaign, SearchParameters("LOAD", cases=100), DirectRunner(campaign))  # type: ignore[arg-type]
+    result = study.run(RecordingWatch())
+    # a generation of three strategies has 12 cases
+    assert 100 - 12 < result.search_cases <= 100
+    assert set(result.failures[0].values) == {"loads.0"}
+
+
 class DirectRunner:
     """Runs the cases of a study in this process, without a store."""
 

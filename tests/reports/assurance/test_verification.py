@@ -164,6 +164,13 @@ def test_every_changed_file_is_named(package: Path, name: str) -> None:
     assert "NOT VERIFIED" in out
 
 
+@pytest.mark.parametrize("runs", ["5", '"limit-state"', '["../limit-state"]', '[".."]', "[" * 100_000])
+def test_damaged_manifest_is_reported(package: Path, runs: str) -> None:
+    (package / MANIFEST).write_text(f'{{"schema": 1, "files": {{}}, "runs": {runs}}}')
+    with pytest.raises(CampaignError, match=f"{MANIFEST} is damaged"):
+        verify_package(package)
+
+
 def test_missing_additional_and_linked_files_are_named(package: Path) -> None:
     (package / RUN / "junit.xml").unlink()
     (package / "manifest.json.note").write_text("")

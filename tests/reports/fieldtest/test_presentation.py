@@ -31,13 +31,13 @@ def field_frame() -> pd.DataFrame:
 def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     run = read_run(make_run(field_frame, requirements=[VELOCITY]))
     short_time, same_direction, opposite_direction = field_cells(Subject(run, "velocity_error_m_s", 5.0))
-    assert (short_time["valid"].hits, short_time["paper_percent"]) == (20, 100)
-    assert short_time["difference_points"] == pytest.approx(0.0)
-    assert (same_direction["valid"].hits, same_direction["paper_percent"]) == (10, 40)
-    assert same_direction["difference_points"] == pytest.approx(10.0)
-    assert opposite_direction["paper_percent"] is None
-    assert np.isnan(opposite_direction["difference_points"])
-    assert np.isnan(opposite_direction["largest"])  # largest error
+    assert (short_time.valid.hits, short_time.paper_percent) == (20, 100)
+    assert short_time.difference_points == pytest.approx(0.0)
+    assert (same_direction.valid.hits, same_direction.paper_percent) == (10, 40)
+    assert same_direction.difference_points == pytest.approx(10.0)
+    assert opposite_direction.paper_percent is None
+    assert np.isnan(opposite_direction.difference_points)
+    assert np.isnan(opposite_direction.largest)  # largest error
 
 
 @pytest.mark.slow

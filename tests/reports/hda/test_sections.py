@@ -11,13 +11,8 @@ import pytest
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.effects import estimate_effects
 from marsyard.reports.hda.landing_cases import PAPER
-from marsyard.reports.hda.paper_sections import (
-    SizeResult,
-    find_knee,
-    run_times_section,
-    touchdown_section,
-    tracking_curves,
-)
+from marsyard.reports.hda.limits_section import SizeResult, find_knee, tracking_curves
+from marsyard.reports.hda.paper_sections import run_times_section, touchdown_section
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
     MAP_CONDITIONS,
@@ -135,11 +130,23 @@ def test_distance_to_hazards_is_0_on_unsafe_ground() -> None:
     frame["site_hazard_distance_m"] = [0.5, 0.08, np.inf, np.nan]
     frame["touchdown_hazard_distance_m"] = [0.04, 0.3, np.inf, np.nan]
     distances = hazard_distances(frame)
-    np.testing.assert_array_equal(distances["reported site"], [0.5, 0.0, np.inf])
-    np.testing.assert_array_equal(distances["true touchdown"], [0.0, 0.3, np.inf])
+    np.testing.assert_array_equal(distances["reported site"].distances_m, [0.5, 0.0, np.inf])
+    np.testing.assert_array_equal(distances["true touchdown"].distances_m, [0.0, 0.3, np.inf])
     grid = drop_empty_columns(distance_grid(distances))
     # three values have no quantiles
     assert [row[1:] for row in grid.rows] == [["3", "1", "1", "0"], ["3", "1", "1", "0"]]
+
+
+def test_bound_of_the_distance_to_hazards_allows_for_shared_terrains() -> None:
+    frame = landing_frame(60).assign(landed=True, site_reported=True, site_safe=True, touchdown_safe=True)
+    frame["site_hazard_distance_m"] = np.linspace(1.0, 2.0, 60)
+    frame["touchdown_hazard_distance_m"] = np.nan
+    # 60 values have a lower bound of the 5 % quantile at 90 % confidence: 0.95^60 = 0.05; two terrains have none
+    bounds = [
+        distance_grid(hazard_distances(frame.assign(terrain=terrains))).rows[0][-1]
+        for terrains in (np.arange(60), np.arange(60) % 2)
+    ]
+    assert bounds == ["1.000", "–"]
 
 
 def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:

@@ -15,11 +15,11 @@ from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
 from marsyard.reports.localisation.presentation import (
     LOCALISATION,
-    conditions_section,
     draw_errors,
     draw_landmarks,
     draw_map,
     is_localisation_case,
+    light_section,
     position_section,
     view,
 )
@@ -178,7 +178,7 @@ def test_position_section_has_rates_and_quantiles() -> None:
 
 
 def test_condition_section_is_created() -> None:
-    section = conditions_section(_make_subject(localisation_frame(200)))
+    section = light_section(_make_subject(localisation_frame(200)))
     bins = section.data["by_condition"]
     assert sum(entry["n"] for entry in bins) == 200
     assert [entry["fixed_in_time"].hits for entry in bins] == [entry["answered"].hits for entry in bins]
@@ -189,14 +189,14 @@ def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
     assert section.data["rates"]["Coarse position within 200 m"].n == 0
 
 
-@pytest.mark.parametrize("section", [position_section, conditions_section])
+@pytest.mark.parametrize("section", [position_section, light_section])
 def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     """A campaign in which no descent has a position still reports that fact."""
     created = section(_make_subject(localisation_frame(30, fixed_fraction=0.0)))
     assert created.blocks
 
 
-@pytest.mark.parametrize("section", [position_section, conditions_section])
+@pytest.mark.parametrize("section", [position_section, light_section])
 def test_other_campaigns_have_no_section(section: Any) -> None:
     assert section(_make_subject(pd.DataFrame({"case": [0, 1], "sun_difference_deg": [1.0, 2.0]}))) is None
 

@@ -56,6 +56,10 @@ def _enumerate_tail(sizes: Sizes, statistic: int, rates: np.ndarray, weights: np
     )
 
 
+def test_bound_at_a_risk_below_the_rounding_errors_is_1() -> None:
+    assert TerrainCounts(((4, 30),), 300).max_rate(1e-12) == 1.0
+
+
 @pytest.mark.parametrize("statistic", [1, 2, 4, 9, 13, 20])
 def test_tail_equals_enumeration(statistic: int) -> None:
     sizes, rates, weights = ((1, 2), (2, 2), (3, 2)), np.array([0.05, 0.4, 0.9]), np.array([0.6, 0.3, 0.1])

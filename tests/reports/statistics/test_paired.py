@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.difference_tests import compare_errors, compare_successes, symmetry_p_value
+from marsyard.reports.statistics.paired_tests import compare_errors, compare_successes, symmetry_p_value
 
 #: Terrain numbers of 200 cases: 8 cases on each of 25 terrains.
 TERRAINS = np.repeat(np.arange(25), 8)

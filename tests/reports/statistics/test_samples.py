@@ -27,6 +27,11 @@ def test_quantile_bounds_have_nominal_coverage() -> None:
     assert np.mean(bounds[:, 1] >= true_quantile) >= 0.9 - 0.024
 
 
+def test_standard_deviation_interval_of_eight_values_exists_at_any_confidence() -> None:
+    lower, upper = standard_deviation_interval(np.arange(8.0), 0.99999)
+    assert 0.0 < lower < np.std(np.arange(8.0), ddof=1) < upper < math.inf
+
+
 def test_mean_interval_has_nominal_coverage() -> None:
     # the coverage of the BCa interval of 40 exponential values is about 2 % too low (Efron 1987)
     # with 250 samples the coverage has a standard deviation of 1.4 %

@@ -5,13 +5,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.accuracy_sections import (
-    goal_section,
-    losses_grid,
-    measured_accuracy,
-    summarize_cameras,
-    table_1_section,
-)
+from marsyard.reports.vtt.goal_section import goal_section, losses_grid, summarize_cameras
 from marsyard.reports.vtt.paper_sections import (
     regression_section,
     single_run_section,
@@ -20,6 +14,7 @@ from marsyard.reports.vtt.paper_sections import (
 )
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.vtt.steps_section import step_rates, steps_section
+from marsyard.reports.vtt.table_1_section import measured_accuracy, table_1_section
 from marsyard.reports.vtt.tracking_runs import CHECKOUT_1, CHECKOUT_3, PAPER, REGRESSION, TERRAINS
 from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table, set_values
 
@@ -39,12 +34,10 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     frame.loc[4:, "drift_px"] = [3.0, 4.0, 5.0, 0.0]
     navcam, pancam = measured_accuracy(frame)
     # the errors have 0.1 m rms: 3 sigma in cm
-    assert navcam["designation_cm"] == pytest.approx(300.0 * 0.1)
+    assert navcam.designation_cm == pytest.approx(300.0 * 0.1)
     # Eq. 3 of the tracking paper: sqrt(0.1^2 + 0.05^2)
-    assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
-    assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
-    # the disparity error does not follow from the designation error: most of it is caused by the mast
-    assert "disparity_px" not in navcam
+    assert navcam.untracked_cm == pytest.approx(300.0 * np.hypot(0.1, 0.05))
+    assert pancam.drift_px == pytest.approx(np.sqrt(12.5))
     table = read_table(table_1_section(make_subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2) = 1.63
     assert table[0]["Paper's formula: with tracking (cm)"] == "1.6"
@@ -80,16 +73,12 @@ def test_step_rates_are_compared_with_fig_8() -> None:
     frame = _make_two_tracker_rows()
     frame.loc[0, ["selectable", "tracked", "no_false_track"]] = False  # unselectable targets are excluded
     rates = step_rates(make_subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
-    rate_at = {(rate["line"], round(rate["step"])): rate for rate in rates}
-    assert (rate_at["vtt", 5]["good"].hits, rate_at["vtt", 5]["good"].n, rate_at["vtt", 5]["paper_percent"]) == (
-        9,
-        9,
-        100.0,
-    )
-    assert (rate_at["vtt", 5]["all_targets"].hits, rate_at["vtt", 5]["all_targets"].n) == (9, 10)
-    assert rate_at["vtt", 5]["false_tracks"].hits == 0
-    assert (rate_at["pure-ncc", 23]["good"].hits, rate_at["pure-ncc", 23]["paper_percent"]) == (4, 15.0)
-    assert rate_at["pure-ncc", 10]["paper_percent"] is None
+    rate_at = {(rate.line, round(rate.step)): rate for rate in rates}
+    assert (rate_at["vtt", 5].good.hits, rate_at["vtt", 5].good.n, rate_at["vtt", 5].paper_percent) == (9, 9, 100.0)
+    assert (rate_at["vtt", 5].all_targets.hits, rate_at["vtt", 5].all_targets.n) == (9, 10)
+    assert rate_at["vtt", 5].false_tracks.hits == 0
+    assert (rate_at["pure-ncc", 23].good.hits, rate_at["pure-ncc", 23].paper_percent) == (4, 15.0)
+    assert rate_at["pure-ncc", 10].paper_percent is None
     section = steps_section(make_subject(frame, legs=[{"motion": "approach"}]))
     assert "Fig. 8" in section.title
     assert "Open marks" in section.blocks[0].figures[0].caption
@@ -106,14 +95,14 @@ def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
     )
     frame = frame.reset_index(drop=True)
     circle_rates = step_rates(make_subject(frame, legs=[{"motion": "circle"}]))
-    assert [(rate["line"], rate["step"]) for rate in circle_rates[:3]] == [
+    assert [(rate.line, rate.step) for rate in circle_rates[:3]] == [
         ("200 px", 5.0),
         ("200 px", 10.0),
         ("200 px", 15.0),
     ]
-    assert circle_rates[2]["paper_percent"] == pytest.approx(100.0 * 9 / 11)
+    assert circle_rates[2].paper_percent == pytest.approx(100.0 * 9 / 11)
     turn_rates = step_rates(make_subject(frame, legs=[{"motion": "turn"}]))
-    assert {rate["paper_percent"] for rate in turn_rates} == {None}
+    assert {rate.paper_percent for rate in turn_rates} == {None}
     section = steps_section(make_subject(frame, legs=[{"motion": "turn"}]))
     # without numbers in the paper, there is no column of dashes and no mark to explain
     assert "Open marks" not in section.blocks[0].figures[0].caption
@@ -133,7 +122,7 @@ def test_oblique_targets_are_reported_separately() -> None:
     )
     run_subject = make_subject(pd.concat([face_on, oblique, hidden], ignore_index=True), legs=[{"motion": "circle"}])
     (cell,) = step_rates(run_subject)
-    assert (cell["good"].hits, cell["good"].n, cell["all_targets"].n) == (6, 6, 13)
+    assert (cell.good.hits, cell.good.n, cell.all_targets.n) == (6, 6, 13)
     section = steps_section(run_subject)
     grid = section.blocks[-1].grid
     assert [list(row) for row in grid.rows] == [["0 to 45", "6 of 6"], ["70 to 90", "0 of 4"]]

@@ -14,7 +14,7 @@ from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.campaigns.definition.components import own_limits
+from marsyard.campaigns.definition.components import algorithm_process_limits
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
@@ -152,7 +152,7 @@ def test_limit_of_an_algorithm_does_not_end_the_case(tmp_path: Path) -> None:
         """
     )
     rows = read_case_rows(run(path, tmp_path / "run", RecordingWatch()))
-    assert own_limits(load_campaign(str(path)).definition) == (64.0, 2e9)
+    assert algorithm_process_limits(load_campaign(str(path)).definition) == (64.0, 2e9)
     assert [(row["outcome"], row["Hanging.outcome"]) for row in rows] == [("VALID", "TIMED_OUT")] * 2
 
 

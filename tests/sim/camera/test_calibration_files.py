@@ -118,6 +118,9 @@ def test_pinhole_models_of_ames_stereo_pipeline_are_read(tmp_path: Path) -> None
     assert_projects_as_opencv(path, RADIAL, SIZE)
     path.write_text(TSAI.partition("TSAI")[0] + "NULL\n")
     assert_projects_as_opencv(path, [0.0] * 4, SIZE)
+    # an empty line between the version and the model, and no line with the lens
+    path.write_text(TSAI.partition("TSAI")[0].replace("PINHOLE", "\nPINHOLE"))
+    assert_projects_as_opencv(path, [0.0] * 4, SIZE)
     with pytest.raises(CameraFileError, match=r"camera.tsai: size: missing: .*allowed: size = \[columns, rows\]"):
         read_camera(path)
 

@@ -219,6 +219,12 @@ LABEL_FAULTS = [
 ]
 
 
+def test_one_unit_can_be_that_of_all_components(tmp_path: Path) -> None:
+    start, _, rest = LABEL.partition('(METER,"N/A"')
+    expected = read_camera(write_file(tmp_path, LABEL))
+    assert read_camera(write_file(tmp_path, f'{start}"N/A"{rest.partition(")")[2]}')) == expected
+
+
 @pytest.mark.parametrize(("old", "new", "fault"), LABEL_FAULTS, ids=[f"{new!r}" for _, new, _ in LABEL_FAULTS])
 def test_label_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert_fault(tmp_path / "faulty.IMG", LABEL, (old, new), fault, read_camera)
@@ -263,7 +269,7 @@ def test_models_of_text_files_are_read(tmp_path: Path, model: str, linearity: fl
 
 def test_written_cameras_round_trip(tmp_path: Path, camera: CameraModel) -> None:
     path = tmp_path / "camera.txt"
-    write_cahvor(camera, path, comment="the left one\nModel = NONE")
+    write_cahvor(camera, path, comment="the left one\nModel = NONE", frame="body\nModel = NONE")
     assert read_cahvor(path) == camera
     assert read_camera(path) == camera
     assert path.read_text().startswith("# the left one\n# Model = NONE\n")

@@ -190,3 +190,9 @@ def test_stuck_altimeter_prevents_deceleration() -> None:
 def test_flight_is_defined_only_within_its_span() -> None:
     with pytest.raises(ValueError, match="outside of the motion"):
         _fly_transit(_make_air(0)).path.state(99.0)
+
+
+@pytest.mark.parametrize("name", ["drag_s", "contact_s"])
+def test_time_constants_shorter_than_a_step_are_rejected(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is 0.02; allowed: above step_s, 0.02"):
+        RotorcraftParameters.model_validate({name: 0.02})

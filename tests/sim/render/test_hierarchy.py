@@ -64,6 +64,7 @@ def test_few_rays_and_parallel_rays_equal_exhaustive_search() -> None:
     np.testing.assert_allclose(distances, expected, rtol=1e-9)
     np.testing.assert_array_equal(numbers >= 0, np.isfinite(expected))
     assert first_hits(objects.triangles[:0], EYE[None], rays)[1].tolist() == [-1] * 50
+    assert [values.size for values in first_hits(objects.triangles, EYE[None], rays[:0])] == [0, 0]
     origins = np.random.default_rng(10).uniform(-12.0, 12.0, (500, 3))
     parallel = np.broadcast_to(rays[0], origins.shape)
     expected = cast_triangles(objects, origins, parallel, nearest=0.0)

@@ -13,7 +13,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun, ground_shadow
 from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.casters import are_occluded, casters_towards
-from marsyard.sim.render.cones import ground_in_cones
+from marsyard.sim.render.cones import Bounds, ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool, UInt32
 from marsyard.sim.render.ground_shadow import (
     GroundShadow,
@@ -184,7 +184,7 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
     """The area includes the border of the terrain period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = Scene(terrain, (0.0, 0.0), sun, LAMBERT).height_range_m
-    area_m = (-40.0, 60.0, 700.0, 760.0)
+    area_m = Bounds(-40.0, 60.0, 700.0, 760.0)
     full_shadow, area_shadow = (
         compute_ground_shadow(terrain, sun, heights),
         compute_ground_shadow(terrain, sun, heights, area_m),

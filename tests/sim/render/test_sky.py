@@ -23,7 +23,7 @@ from marsyard.sim.render import (
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.device import Float64
 from marsyard.sim.terrain import Surface
-from tests.sim.scenes import LAMBERT, descent_camera, flat_ground
+from tests.sim.scenes import LAMBERT, descent_camera, flat_ground, make_ground
 
 #: Sky with an optical depth of 0.5, a single-scattering albedo of 0.95 and an asymmetry of 0.65.
 DUSTY = Photometry(sky_fraction=0.25, sky=DustySky(0.5, 0.95, 0.65))
@@ -189,6 +189,15 @@ def test_scattered_light_does_not_exceed_the_removed_light() -> None:
 def test_equal_generators_draw_equal_clouds() -> None:
     assert _make_layer(7).cover.tobytes() == _make_layer(7).cover.tobytes()
     assert _make_layer(7).cover.tobytes() != _make_layer(8).cover.tobytes()
+
+
+def test_clouds_cast_no_shadow_without_direct_sunlight(renderer: Renderer) -> None:
+    hills = make_ground(np.random.default_rng(3).uniform(0.0, 40.0, (64, 64)), 64.0)
+    sun = Sun(direction(1.0, 0.0))
+    scenes = (replace(_make_scene(clouds), surface=hills, sun=sun) for clouds in (_make_layer(), None))
+    cloudy, clear = (_render_from_above(renderer, scene, descent_camera(64)).radiance for scene in scenes)
+    assert np.all(np.isfinite(clear))
+    np.testing.assert_array_equal(cloudy, clear)
 
 
 def test_transmittance_of_the_sky_is_nan() -> None:

@@ -62,6 +62,14 @@ def test_moments_of_the_linear_sky_are_those_of_the_dusty_sky() -> None:
     assert 0.5 < towards_sun < 1.2
 
 
+@pytest.mark.parametrize("elevation_deg", [0.05, 1.0])
+def test_light_of_a_dusty_sky_under_a_very_low_sun_is_finite(elevation_deg: float) -> None:
+    sun = Sun(direction(0.4, np.radians(elevation_deg)))
+    light = DustySky(10.0, 0.94, 0.65).light(sun, 0.45)
+    assert np.isfinite(to_host(light.gradient)).all()
+    assert 0.0 < DustySky(10.0, 0.94, 0.65).disc_fraction(float(sun.direction[2])) < 1.0
+
+
 def _draw_aureole(log2_count: int) -> Float64[np.ndarray, "n 3"]:
     """Draw directions that are distributed uniformly over the aureole."""
     directions = _draw_sphere(log2_count)

@@ -84,7 +84,21 @@ def test_mirrored_images_are_rejected(euroc: Path) -> None:
         ("absent.yaml", "absent.yaml: file: cannot be read"),
         ({"file": "FILE", "focal": 3}, "unknown key focal for a camera file; allowed: file, number"),
         ({"file": "FILE", "number": 1}, "number is 1; allowed: 0 to 0"),
+        ({"file": "FILE", "subframe_folded_in": "false"}, "subframe_folded_in is 'false'; allowed: true or false"),
+        ({"file": "FILE", "size": [640, 480]}, "size: 640 x 480; allowed: 752 x 480, the size in the file"),
         ({"model": "CAHVOR", "columns": 64, "rows": 64, "h": (1, 0, 0), "v": (0, 1, 0)}, "CAHVOR requires o and r"),
+        (
+            {
+                "model": "CAHV",
+                "columns": 64,
+                "rows": 64,
+                "h": (1, 0, 0),
+                "v": (0, 1, 0),
+                "r": (0, 0, 0),
+                "linearity": 0,
+            },
+            "CAHV has no r and linearity",
+        ),
     ],
 )
 def test_camera_errors_are_reported(euroc: Path, values: object, fault: str) -> None:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from marsyard.sim.sensor.gps import Gps, GpsParameters, Outage, RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.gps import Gps, GpsParameters
+from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver, RtkSolutions
 from tests.sim.sensor.motions import Swaying
 
 MOTION = Swaying(position_m=(10.0, 20.0, 30.0), velocity_m_s=(1.0, -0.5, 0.2), sway_m=1.0)

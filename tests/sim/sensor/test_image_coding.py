@@ -41,6 +41,12 @@ def test_counts_stay_within_full_scale() -> None:
     assert compress_and_decompress(edges, 0.5, 4095).max() == 4095
 
 
+def test_images_that_are_too_small_for_the_coder_are_rejected() -> None:
+    assert compress_and_decompress(COUNTS[:32, :40], 16.0, 4095).shape == (32, 40)
+    with pytest.raises(ValueError, match="an image of 40 x 31 pixels; allowed for compression: from 32 on each side"):
+        compress_and_decompress(COUNTS[:31, :40], 16.0, 4095)
+
+
 @pytest.mark.parametrize("bits", [0.0, 17.0, float("nan")])
 def test_invalid_bits_per_pixel_are_rejected(bits: float) -> None:
     with pytest.raises(ValueError, match=r"allowed: 0\.1 to 16"):

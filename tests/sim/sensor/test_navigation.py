@@ -19,7 +19,6 @@ from marsyard.sim.dynamics.rotorcraft import (
     simulate_transit,
 )
 from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.sensor.gps import Outage, RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.helicopter_navigation import (
     FilterParameters,
     FilterState,
@@ -28,6 +27,7 @@ from marsyard.sim.sensor.helicopter_navigation import (
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
+from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 
 #: Gravity, m/s2; number of simulated flights.

@@ -128,6 +128,8 @@ def test_hirise_tile_is_imported(shared_data: Path) -> None:
     [
         ({"dem": np.zeros((9, 9))}, "does not contain dem_gsd"),
         ({"dem": np.zeros(9), "dem_gsd": 1.0}, r"grid of shape \(9,\)"),
+        ({"dem": np.zeros((9, 9)), "dem_gsd": np.nan}, "a distance of nan m between grid points; it must be positive"),
+        ({"dem": np.zeros((9, 9)), "dem_gsd": 9.0, "ortho": np.ones((9, 9)), "ortho_gsd": 0.0}, "distance of 0 m"),
         ({"dem": np.full((9, 9), np.nan), "dem_gsd": 1.0}, "no valid height"),
         ({"dem": np.zeros((400, 9)), "dem_gsd": 1.0}, r"increase terrain\.samples"),
         ({"dem": np.zeros((9, 9)), "dem_gsd": 1.0}, "wider than twice the border"),
@@ -138,6 +140,13 @@ def test_file_errors_are_reported(tmp_path: Path, content: dict[str, object], me
     np.savez(path, **content)  # type: ignore[arg-type]
     with pytest.raises(TerrainFileError, match=message):
         embed(RealTerrain(dtm=path), 256, 1.0)
+
+
+def test_terrain_with_coarser_samples_than_the_dtm_is_wide_is_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "narrow.npz"
+    np.savez(path, dem=np.zeros((40, 5)), dem_gsd=0.7)
+    with pytest.raises(TerrainFileError, match=r"27\.3 m; it must be wider than terrain\.spacing_m, 3 m"):
+        embed(RealTerrain(dtm=path, border_m=0.4), 128, 3.0)
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:

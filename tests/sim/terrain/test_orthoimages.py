@@ -233,6 +233,16 @@ def test_colours_become_luminance(tmp_path: Path, dtype: str, alpha: bool) -> No
     assert np.count_nonzero(np.isnan(ortho.values)) == (4 * 2 * COLUMNS if alpha else 0)
 
 
+def test_opacity_before_the_brightness_is_not_brightness(tmp_path: Path) -> None:
+    opacity, brightness = np.full(BRIGHTNESS.shape, 255), np.full(BRIGHTNESS.shape, 90)
+    opacity[:4] = 0
+    bands = np.array([opacity, brightness]).astype(np.uint8)
+    source = make_source(tmp_path, bands, colorinterp=[ColorInterp.alpha, ColorInterp.gray])
+    check_source(source)
+    _, ortho = read_rasters(source)
+    assert set(ortho.values[4:-4].ravel()) == {90.0}
+
+
 @pytest.mark.parametrize(
     ("bands", "changes", "problem"),
     [

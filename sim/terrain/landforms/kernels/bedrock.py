@@ -7,19 +7,32 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import Array
-from marsyard.sim.terrain.landforms.kernels.shapes import Grid
+from marsyard.sim.terrain.kernels import Array, Grid
+
+
+class NearestCells(NamedTuple):
+    """The Voronoi cells next to a position; lengths are in units of the squares of the points' grid.
+
+    - row, column: of the nearest point; second_row, second_column: of the second nearest one
+    - offset_x, offset_y: of the nearest point from the position
+    - border: distance of the position from the border of both cells
+    """
+
+    row: int
+    column: int
+    second_row: int
+    second_column: int
+    offset_x: float
+    offset_y: float
+    border: float
 
 
 @njit(cache=True, error_model="numpy")
-def _find_cells(positions: Array, x: float, y: float) -> tuple[int, int, int, int, float, float, float]:
-    """Find the Voronoi cells next to x, y: rows and columns of the two nearest points in `positions`, and the border.
-
-    Returns also the offset of the nearest point, before the distance to the border. `positions` are those of
-    `add_cracks`. Lengths are in units of its squares.
-    """
+def _find_cells(positions: Array, x: float, y: float) -> NearestCells:
+    """Find the Voronoi cells next to x, y; `positions` are those of `add_cracks`."""
     row, column = int(y), int(x)
-    nearest2, second2, nearest, second = 1e9, 1e9, 0, 0
+    # squared distances, and numbers k of the points: those of the 3 x 3 squares around the position
+    nearest2, second2, nearest, second = math.inf, math.inf, 0, 0
     for k in range(9):
         dx, dy = positions[row + k // 3, column + k % 3, 0] - x, positions[row + k // 3, column + k % 3, 1] - y
         distance2 = dx * dx + dy * dy
@@ -32,7 +45,7 @@ def _find_cells(positions: Array, x: float, y: float) -> tuple[int, int, int, in
     second_x, second_y = positions[second_row, second_column, 0] - x, positions[second_row, second_column, 1] - y
     separation = math.sqrt((second_x - nearest_x) ** 2 + (second_y - nearest_y) ** 2)
     border = 0.5 * (second2 - nearest2) / max(separation, 1e-6)
-    return nearest_row, nearest_column, second_row, second_column, nearest_x, nearest_y, border
+    return NearestCells(nearest_row, nearest_column, second_row, second_column, nearest_x, nearest_y, border)
 
 
 @njit(cache=True)
@@ -55,20 +68,23 @@ def add_cracks(
     """
     for i in range(height.shape[0]):
         for j in range(height.shape[0]):
-            border = _find_cells(positions, j * spacing / cell, i * spacing / cell)[6] * cell
+            border = _find_cells(positions, j * spacing / cell, i * spacing / cell).border * cell
             if border < width:
                 strength = 1.0 - border / width
                 height[i, j] -= depth * strength
                 log_albedo[i, j] += contrast * strength
 
 
+#: Columns of a slab: height at its point, metres; slopes along x and y; logarithm of albedo; random number from 0 to 1.
+#: The numbers of two slabs give the width of the joint between them.
+HEIGHT, SLOPE_X, SLOPE_Y, LOG_ALBEDO, NUMBER = range(5)
+
+
 class Slabs(NamedTuple):
     """Slabs of one generation of joints: Voronoi cells with one point in each square of a periodic grid.
 
     - positions: of the points, as in `add_cracks`
-    - slabs: height at the point, slopes along x and y, logarithm of albedo, and a random number from 0 to 1 of each
-      cell, with a margin like the positions, shape (count + 2, count + 2, 5). The numbers of two cells give the width
-      of the joint between them
+    - slabs: columns `HEIGHT` to `NUMBER` of each cell; margin as that of the positions, shape (count + 2, count + 2, 5)
     - cell: side of a square, metres
     - joint, depth: mean half width of a joint, and its depth below the slabs, metres
     - rise: bound of the rise of a tilted slab from its point, metres
@@ -95,15 +111,16 @@ def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float, floa
     x, y = x / cell, y / cell
     x += count if x < 0.0 else (-count if x >= count else 0.0)
     y += count if y < 0.0 else (-count if y >= count else 0.0)
-    row, column, second_row, second_column, offset_x, offset_y, border = _find_cells(positions, x, y)
+    near = _find_cells(positions, x, y)
+    own, other = slabs[near.row, near.column], slabs[near.second_row, near.second_column]
     # uniform from 0 to 1, and equal on both sides of the joint
-    opening = slabs[row, column, 4] + slabs[second_row, second_column, 4]
+    opening = own[NUMBER] + other[NUMBER]
     opening -= 1.0 if opening >= 1.0 else 0.0
-    t = border * cell / max(2.0 * opening * joint, 1e-6)
+    t = near.border * cell / max(2.0 * opening * joint, 1e-6)
     cut = (1.0 - t) ** 2 if t < 1.0 else 0.0
-    tilt = -cell * (slabs[row, column, 1] * offset_x + slabs[row, column, 2] * offset_y)
-    top = slabs[row, column, 0] + min(max(tilt, -rise), rise) - min(1.5 * opening, 1.0) * depth * cut
-    return top, slabs[row, column, 3], slabs[row, column, 4]
+    tilt = -cell * (own[SLOPE_X] * near.offset_x + own[SLOPE_Y] * near.offset_y)
+    top = own[HEIGHT] + min(max(tilt, -rise), rise) - min(1.5 * opening, 1.0) * depth * cut
+    return top, own[LOG_ALBEDO], own[NUMBER]
 
 
 @njit(cache=True, error_model="numpy")

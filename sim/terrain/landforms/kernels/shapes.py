@@ -1,14 +1,14 @@
-"""Compiled kernels of the landforms. Grids are periodic squares with a power of two as side; changed in place."""
+"""Compiled shapes of craters, lava, channels and fans, added to periodic square grids in place.
+
+The side of a grid is a power of two: ``index & (side - 1)`` is the index within the period.
+"""
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import Array, Level
+from marsyard.sim.terrain.kernels import Array, Grid
 
-Grid = NDArray[np.float32]
 #: Relative change of the rim height of a crater per relative change of its radius.
 RIM_HEIGHT_SENSITIVITY = 8.0
 #: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
@@ -18,31 +18,6 @@ RAY_CONTRAST = 0.25
 CORE_RADIUS, RIDGE_WAVELENGTH_M, RIDGE_HEIGHT_M = 0.7, 10.0, 0.15
 #: Finer scallops in the fill's border of large craters: their size, and the factor of their wavenumbers (assumed).
 TEETH, TEETH_STEP = 0.4, 5
-
-
-@njit(cache=True)
-def add_refined(fine: Grid, coarse: Grid) -> None:
-    """Upsample a coarse grid of cubic B-spline coefficients by two (exact subdivision), and add it to the fine grid."""
-    side = coarse.shape[0]
-    row = np.empty(side, dtype=np.float32)
-    one_eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
-    for i in range(2 * side):
-        k = i // 2
-        current = coarse[k]
-        following = coarse[(k + 1) % side]
-        if i % 2 == 0:
-            previous = coarse[k - 1]
-            for j in range(side):
-                row[j] = one_eighth * (previous[j] + following[j]) + six_eighths * current[j]
-        else:
-            for j in range(side):
-                row[j] = half * (current[j] + following[j])
-        fine_row = fine[i]
-        for j in range(side - 1):
-            fine_row[2 * j] += one_eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
-            fine_row[2 * j + 1] += half * (row[j] + row[j + 1])
-        fine_row[2 * side - 2] += one_eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
-        fine_row[2 * side - 1] += half * (row[side - 1] + row[0])
 
 
 @njit(cache=True, inline="always")
@@ -262,29 +237,22 @@ def raise_cones(
     """
     side = height.shape[0]
     period = side * spacing
+    # height from which the coverage is 1: 2 % of the first cone's slope times radius
+    full_height = 0.02 * slope * apexes[0, 2]
     for i in range(side):
         for j in range(side):
             total = 0.0
             for n in range(apexes.shape[0]):
-                dx, dy = abs(j * spacing - apexes[n, 0]), abs(i * spacing - apexes[n, 1])
+                x, y, radius = apexes[n]
+                dx, dy = abs(j * spacing - x), abs(i * spacing - y)
                 dx, dy = min(dx, period - dx), min(dy, period - dy)
                 distance = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
-                remaining = 1.0 - distance / apexes[n, 2]
+                remaining = 1.0 - distance / radius
                 if remaining > 0.0:
-                    z = slope * apexes[n, 2] / concavity * remaining**concavity
+                    z = slope * radius / concavity * remaining**concavity
                     # smooth maximum of all cones: norm of order 8
                     total += z**8
             if total > 0.0:
                 z = total**0.125
                 height[i, j] += z
-                # the coverage is 1 from 2 % of the first cone's slope times radius
-                coverage[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
-
-
-@njit(cache=True)
-def interleave_samples(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
-    """Interleave height and albedo; the albedo is scaled and limited to 1."""
-    for i in range(height.shape[0]):
-        for j in range(height.shape[0]):
-            samples[i, j, 0] = height[i, j]
-            samples[i, j, 1] = min(scale * albedo[i, j], 1.0)
+                coverage[i, j] = min(z / full_height, 1.0)

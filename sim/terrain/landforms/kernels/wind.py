@@ -7,9 +7,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
+from marsyard.sim.terrain.kernels import Array, Grid, Level, bspline_weights, collapse
 
-Grid = NDArray[np.float32]
+#: Maximum strength of the modulation, whose RMS is 1, for the height of a crest (assumed).
+MAX_STRENGTH = 1.6
+#: Minimum and maximum fraction of the wavelength under the slip face.
+MIN_SLIP, MAX_SLIP = 0.01, 0.5
 GridRow = NDArray[np.float32]
 
 
@@ -65,11 +68,11 @@ def _add_row_of_dunes(
     slip_per_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.slip_face_slope)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
-        crest_height = rms_height * min(strength, 1.6)
+        crest_height = rms_height * min(strength, MAX_STRENGTH)
         cycles = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
         # position in the wavelength, 0 and 1 at the troughs; v and w: position on the stoss slope and on the slip face
         u = cycles - np.floor(cycles)
-        slip = min(max(slip_per_height * crest_height, 0.01), 0.5)
+        slip = min(max(slip_per_height * crest_height, MIN_SLIP), MAX_SLIP)
         v = u / (1.0 - slip)
         stoss = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
         w = (1.0 - u) / slip
@@ -91,7 +94,7 @@ def add_dunes(height: Grid, log_albedo: Grid, spacing: float, modulation: Level,
     step = side // cells
     weights = np.empty((step, 4))
     for k in range(step):
-        weights[k] = bspline_weights(k / step)[:4]
+        weights[k] = bspline_weights(k / step)[0]
     row_spline, real, imaginary = np.empty((cells, 2)), np.empty(side), np.empty(side)
     for i in range(side):
         # along one row the modulation is a spline in x only

@@ -1,35 +1,22 @@
-"""Sections on the accuracy of the target's position: at the goal, and Table I of the paper as printed and as measured.
+"""Section on the accuracy of the target's position at the goal, and tables of the runs that lost the target.
 
-Sections, equations and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
+Sections and equations are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from marsyard.algorithms.interface import TargetLoss
-from marsyard.algorithms.vtt.accuracy import (
-    GOAL_M,
-    NAVCAM,
-    NAVIGATION_ERROR,
-    PANCAM,
-    START_M,
-    AccuracyRow,
-    drift_error_m,
-    stereo_range_error_m,
-    table_1,
-    tracked_approach_error_m,
-)
+from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import populations, rates
 from marsyard.reports.blocks import distribution_block
 from marsyard.reports.column_values import numbers
-from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section, has_values
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.vtt.tracking_runs import is_closed_loop, selectable_targets
 from marsyard.reports.wording import NOTHING, format_fraction, note_text
@@ -37,11 +24,12 @@ from marsyard.scenarios.rover.run_state import RunOutcome
 
 
 def losses_grid(frame: pd.DataFrame) -> Grid:
-    """Count runs that ended without a tracked target, by outcome and loss criteria."""
+    """Count runs that ended without a tracked target, by outcome and loss criteria, the largest number first."""
     failed_runs = frame[~populations.flag_mask(frame, "tracked")]
     has_clouds = "clear_sky" in failed_runs and rates.flag_fraction(failed_runs, "clear_sky", value=False).hits > 0
+    groups = failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)])
     rows = []
-    for (outcome, losses), runs in failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)]):
+    for (outcome, losses), runs in sorted(groups, key=lambda group: -len(group[1])):
         azimuth = rates.finite_values(runs, "azimuth_change_max_deg")
         azimuth_text = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
         distance_text = rates.median_text(rates.finite_values(runs, "lost_range_m"), 1)
@@ -49,16 +37,15 @@ def losses_grid(frame: pd.DataFrame) -> Grid:
         row = [str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text]
         n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if has_clouds else 0
         rows.append([*row, f"{n_cloudy:,}"] if has_clouds else row)
-    rows.sort(key=lambda row: -int(row[2].replace(",", "")))
     head = ["Outcome", "Lost by", "Runs", "Lost at a range of (m)", "Maximum azimuth change (deg)"]
     return Grid([*head, "With clouds"] if has_clouds else head, rows)
 
 
 def losses_note(frame: pd.DataFrame) -> str:
     """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
-    occurring = ", ".join(frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(
-        ", "
-    )
+    # a run can be lost by several criteria
+    losses = frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)
+    occurring = {name for names in losses for name in names.split(", ")}
     meanings = [
         f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
     ]
@@ -164,30 +151,34 @@ def _create_camera_blocks(runs: pd.DataFrame) -> list[Block]:
     return blocks
 
 
+#: Example of a pointing error of the mast, degrees; the notes name the position error that it causes.
+_POINTING_ERROR_DEG = 0.1
+
+
 def pointing_error_cm(range_m: float) -> float:
-    """Compute the position error caused by a pointing error of 0.1 deg, centimetres."""
-    return 100.0 * range_m * math.radians(0.1)
+    """Compute the position error that `_POINTING_ERROR_DEG` causes at a range, centimetres."""
+    return 100.0 * range_m * math.radians(_POINTING_ERROR_DEG)
 
 
 def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
     """Describe the errors, those of the paper's cameras by Eqs. 1 and 4, and the runs that the quantiles need."""
-    designs = (PANCAM, NAVCAM)
-    stereo, drift = (
-        " and ".join(f"{100.0 * error_m:.{digits}f} cm ({design.name.lower()})" for design, error_m in errors)
-        for digits, errors in (
-            (2, [(design, stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)) for design in designs]),
-            (3, [(design, drift_error_m(GOAL_M, design.focal_px, 1.0)) for design in designs]),
-        )
-    )
+    stereo_texts, drift_texts = [], []
+    for camera in (PANCAM, NAVCAM):
+        stereo_cm = 100.0 * stereo_range_error_m(GOAL_M, camera.focal_px, camera.baseline_m)
+        drift_cm = 100.0 * drift_error_m(GOAL_M, camera.focal_px, 1.0)
+        stereo_texts.append(f"{stereo_cm:.2f} cm ({camera.name.lower()})")
+        drift_texts.append(f"{drift_cm:.3f} cm ({camera.name.lower()})")
     text = (
         "The position error is the distance of the reported from the true position of the designated point, in the "
         "rover frame. Drift: distance in the last image from the tracked target to the true projection. By Eqs. 1 and "
-        f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {stereo} along the line of sight, and 1 px of "
-        f"drift is {drift} across it. The measured errors also contain errors of the camera calibration and of the "
-        f"mast's pointing: 0.1 deg is {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
+        f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {' and '.join(stereo_texts)} along the line of "
+        f"sight, and 1 px of drift is {' and '.join(drift_texts)} across it. The measured errors also contain errors "
+        f"of the camera calibration and of the mast's pointing: {_POINTING_ERROR_DEG:g} deg is "
+        f"{pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
     )
     if all(np.isfinite(row["quantile_bound_m"]) for row in cameras):
         return text
+    # the largest of n values is an upper bound of the quantile q at the confidence c if q^n <= 1 - c
     name, min_runs = format_fraction(QUANTILE), math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
     return (
         f"{text} Too few runs: for a camera, the {name} quantile needs at least {round(1.0 / (1.0 - QUANTILE))} runs, "
@@ -219,113 +210,3 @@ def goal_section(subject: Subject) -> Section | None:
     return create_section(
         "goal", "Goal", "Target position error at the goal", distribution, *_create_camera_blocks(runs)
     )
-
-
-#: Table I as printed.
-PRINTED = {
-    name: AccuracyRow(name, **row)
-    for name, row in read_paper(Path(__file__).with_name("paper.toml"))["table_1"].items()
-}
-#: Maximum relative deviation of the start and goal distances of a run from those of Table I.
-_MAX_DEVIATION = 0.1
-
-
-def table_1_section(subject: Subject) -> Section | None:
-    """Create the section on Table I: computed, printed and measured; None without completed runs from 10 m to 2 m."""
-    accuracy = measured_accuracy(subject.frame)
-    if not accuracy:
-        return None
-    computed_rows = {row.name: row for row in table_1()}
-    pairs = [
-        (source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed_rows))
-    ]
-    grid = build_grid(
-        pairs,
-        {
-            "Camera": lambda pair: pair[1].name,
-            "Source": lambda pair: pair[0],
-            "3 sigma at the designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
-            "3 sigma at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
-            "3 sigma at the goal with tracking, drift of N px (cm)": lambda pair: pair[1].tracked_formula,
-        },
-    )
-    blocks = [
-        Block(
-            heading="Computed",
-            grid=grid,
-            note=note_text(
-                "vtt.table_1_computed",
-                start=f"{START_M:g}",
-                goal=f"{GOAL_M:g}",
-                odometry=f"{100.0 * NAVIGATION_ERROR:g}",
-            ),
-        ),
-        Block(
-            heading="Measured in this campaign",
-            grid=_measured_grid(accuracy),
-            note=note_text(
-                "vtt.table_1_measured",
-                deviation=f"{100.0 * _MAX_DEVIATION:g}",
-                start=f"{START_M:g}",
-                goal=f"{GOAL_M:g}",
-                start_error=f"{pointing_error_cm(START_M):.1f}",
-                goal_error=f"{pointing_error_cm(GOAL_M):.2f}",
-            ),
-        ),
-    ]
-    data = {"computed": computed_rows, "printed": PRINTED, "measured": accuracy}
-    return Section(
-        "table-1", "Position accuracy", "Accuracy of a target's position (Table I of the paper)", blocks, data
-    )
-
-
-def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
-
-    untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose
-
-    The disparity error cannot be computed from the designation error by Eq. 1, because most of the designation error
-    is caused by the mast and lies across the line of sight.
-    """
-    if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
-        return []
-    distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
-    is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed_runs = selectable_targets(
-        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
-    )
-    # factor 300: 3 sigma in centimetres
-    rows = []
-    for camera in sorted(completed_runs["camera"].unique()):
-        runs = completed_runs[completed_runs["camera"].eq(camera)]
-        designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
-        rows.append(
-            {
-                "camera": str(camera),
-                "runs": len(runs),
-                "designation_cm": 300.0 * rates.rms(designation),
-                "untracked_cm": 300.0 * rates.rms(np.hypot(designation, pose)),
-                "tracked_cm": 300.0 * rates.rms(numbers(runs, "position_error_m")),
-                "drift_px": rates.rms(numbers(runs, "drift_px")),
-            }
-        )
-    return rows
-
-
-def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
-    quantities = ("Designation", "Without tracking", "With tracking")
-    pairs = [(f"{name} (cm)", f"Paper: {name.lower()} (cm)") for name in quantities[:2]]
-    pairs.append((f"{quantities[2]} (cm)", "Paper's formula: with tracking (cm)"))
-    rows = []
-    for row in accuracy:
-        printed_row = next(
-            (row_of_paper for name, row_of_paper in PRINTED.items() if row["camera"].endswith(name.lower())), None
-        )
-        paper = [NOTHING] * 3
-        if printed_row is not None:
-            paper_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
-            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{paper_cm:.1f}"]
-        measured = [f"{row[name]:.1f}" for name in ("designation_cm", "untracked_cm", "tracked_cm")]
-        texts = [text for pair in zip(measured, paper, strict=True) for text in pair]
-        rows.append([row["camera"], f"{row['runs']:,}", *texts, f"{row['drift_px']:.1f}"])
-    return Grid(["Camera", "Runs", *(heading for pair in pairs for heading in pair), "Drift, rms (px)"], rows)
