@@ -103,7 +103,7 @@ class Mounds:
             scaled_norm = dr.sqrt(dr.squared_norm(horizontal) + scaled_up * scaled_up)
             cosine = dr.dot(offset, horizontal) / (distance * scaled_norm)
             overlap = disc_overlap(larger(angle, 1e-3), Float(AUREOLE_RADIUS_RAD), dr.acos(clip(cosine, -1.0, 1.0)))
-            aureole += Int32(dr.select(height > 0.0, _PARTS * overlap, 0.0))
+            aureole += Int32(dr.select((height > 0.0) & (angle > 0.0), _PARTS * overlap, 0.0))
             return k + 1, east, north, up, aureole, is_active & (k + 1 < end)
 
         state = (UInt32(first), Int32(0), Int32(0), Int32(0), Int32(0), active & (first < end))

@@ -183,7 +183,7 @@ class Scene:
     @cached_property
     def occluders(self) -> Occluders:
         """Occluders of the sun."""
-        return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
+        return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint, self.among_objects)
 
     @cached_property
     def obstructions(self) -> Obstructions | None:

@@ -73,11 +73,15 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class Occluders:
-    """Occluders of the sun: the ground's shadow, the objects' triangles, and the region that objects may shade."""
+    """Occluders of the sun: the ground's shadow, the objects' triangles, and the region that objects may shade.
+
+    `knows_outlines`: whether the bodies that shade the ground are also `obstructions`, which hide the aureole from it.
+    """
 
     shadow: GroundShadow | None
     casters: Casters | None
     footprint: Footprint | None
+    knows_outlines: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +204,7 @@ def visible_sun(
         if len(pixel) > 0:
             is_hidden, is_object = _shade_by_objects(occluders.casters, objects, pose, rays, hits, pixel)
             dr.scatter(visible.sun, Float(0.0), pixel, is_hidden)
-            # a scene without a footprint knows the outlines of bodies seen from the ground
-            is_unknown = is_hidden if occluders.footprint is not None else is_hidden & is_object
+            is_unknown = is_hidden & is_object if occluders.knows_outlines else is_hidden
             aureole = AUREOLE_BEHIND_BODY * dr.gather(Float, visible.aureole, pixel, is_unknown)
             dr.scatter(visible.aureole, aureole, pixel, is_unknown)
     return visible
