@@ -1,4 +1,4 @@
-"""Checks of the sky that a rover, rocks and relief hide from the ground, by casting rays."""
+"""Checks of the sky and the aureole that a rover, rocks and relief hide from the ground, by casting rays."""
 
 from collections.abc import Iterator
 
@@ -12,16 +12,18 @@ from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import LANDING, MAST
 from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.dynamics.rover import MER, settle
+from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, Scene, Sun
 from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f64, Bool
 from marsyard.sim.render.rover import rover_objects
+from marsyard.sim.render.sky import AUREOLE_RADIUS_RAD
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.terrain import RockField, RockParameters, Surface, TerrainParameters, sites, synthesise
 
-#: Maximum RMS differences of the hidden fraction of the sky: wheels, legs, mast and arm are not part of a rover's
-#: shelter, and rocks are no half spheroids. About twice the measured values.
-LIMITS = {"a rover": 0.1, "rocks": 0.06}
+#: Maximum RMS differences of the hidden fractions of the sky and of the aureole: wheels, legs, mast and arm are not
+#: part of a rover's shelter, and rocks are no half spheroids. About twice the measured values.
+LIMITS = {("sky", "a rover"): 0.1, ("sky", "rocks"): 0.06, ("aureole", "a rover"): 0.2, ("aureole", "rocks"): 0.2}
 #: Side of the level ground, metres, and half width of the compared area around its middle.
 SIDE_M, HALF_WIDTH_M = 64, 1.5
 #: Sites whose relief hides a part of the sky.
@@ -37,6 +39,17 @@ def _draw_directions(log2_count: int) -> Float64[np.ndarray, "n 3"]:
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sqrt(up_squared)], axis=1)
 
 
+def _draw_aureole(log2_count: int, sun: Sun) -> Float64[np.ndarray, "n 3"]:
+    """Draw directions that are distributed uniformly over the aureole."""
+    fractions, turns = qmc.Sobol(2, rng=np.random.default_rng(4)).random_base2(log2_count).T
+    cosine, turns = 1.0 - fractions * (1.0 - np.cos(AUREOLE_RADIUS_RAD)), 2.0 * np.pi * turns
+    sine, towards = np.sqrt(1.0 - cosine**2), sun.direction
+    first = np.cross(towards, [0.0, 0.0, 1.0])
+    first /= np.linalg.norm(first)
+    sideways = np.outer(np.cos(turns), first) + np.outer(np.sin(turns), np.cross(towards, first))
+    return cosine[:, None] * towards + sine[:, None] * sideways
+
+
 def _make_objects(ground: Surface) -> dict[str, Objects]:
     """Place a rover, and rocks, in the middle of the ground."""
     middle = 0.5 * SIDE_M
@@ -48,29 +61,35 @@ def _make_objects(ground: Surface) -> dict[str, Objects]:
 
 
 def compare_hidden_sky(quick: bool) -> Iterator[Measure]:
-    """Compare the fraction of the sky's light that is hidden from points on level ground with ray casting."""
-    count, rays = (40, _draw_directions(7)) if quick else (200, _draw_directions(9))
+    """Compare the light of sky and aureole that is hidden from points on level ground with ray casting."""
+    sun = Sun(direction(2.0, np.radians(45.0)))
+    count, log2_rays = (40, 7) if quick else (200, 9)
+    directions = {"sky": _draw_directions(log2_rays), "aureole": _draw_aureole(log2_rays, sun)}
     samples = np.zeros((SIDE_M, SIDE_M, 2), dtype=np.float32)
     ground = Surface.from_samples(samples, 1.0)
     points = np.zeros((count, 3))
     points[:, :2] = 0.5 * SIDE_M + np.random.default_rng(6).uniform(-HALF_WIDTH_M, HALF_WIDTH_M, (count, 2))
     for name, objects in _make_objects(ground).items():
-        zenith = Sun(np.array([0.0, 0.0, 1.0]))
-        scene = Scene(ground, (0.5 * SIDE_M, 0.5 * SIDE_M), zenith, LAMBERT, objects, among_objects=True)
+        scene = Scene(ground, (0.5 * SIDE_M, 0.5 * SIDE_M), sun, LAMBERT, objects, among_objects=True)
         assert scene.obstructions is not None
         is_ground, is_object = (Bool([value] * count) for value in (True, False))
-        vectors = scene.obstructions.hide_sky(vectors_to_device(Array3f64, points), is_ground, is_object)
-        ranges = cast_triangles(objects, np.repeat(points, len(rays), axis=0), np.tile(rays, (count, 1)), nearest=1e-4)
-        expected = np.isfinite(ranges).reshape(count, -1).mean(axis=1)
+        light = scene.obstructions.hide_light(vectors_to_device(Array3f64, points), is_ground, is_object)
+        hidden = {"sky": to_host(light.sky)[:, 2], "aureole": to_host(light.aureole)}
+        expected = {}
+        for what, rays in directions.items():
+            origins = np.repeat(points, len(rays), axis=0)
+            ranges = cast_triangles(objects, origins, np.tile(rays, (count, 1)), nearest=1e-4)
+            expected[what] = np.isfinite(ranges).reshape(count, -1).mean(axis=1)
         # points inside a body see no sky at all
-        outside = expected < 1.0
-        difference = (to_host(vectors)[:, 2] - expected)[outside]
-        how = (
-            f"{outside.sum()} points within {HALF_WIDTH_M} m, {len(rays)} rays each; ray casting: "
-            f"{expected[outside].mean():.0%} hidden in the mean; mean difference {difference.mean():+.1%}"
-        )
-        claim = f"fraction of the sky that {name} hides, RMS difference from ray casting"
-        yield Measure(claim, float(np.sqrt(np.mean(difference**2))), "", LIMITS[name], how)
+        outside = expected["sky"] < 1.0
+        for what, fraction in expected.items():
+            difference = (hidden[what] - fraction)[outside]
+            how = (
+                f"{outside.sum()} points within {HALF_WIDTH_M} m, {len(directions[what])} rays each; ray casting: "
+                f"{fraction[outside].mean():.0%} hidden in the mean; mean difference {difference.mean():+.1%}"
+            )
+            claim = f"fraction of the {what} that {name} hides, RMS difference from ray casting"
+            yield Measure(claim, float(np.sqrt(np.mean(difference**2))), "", LIMITS[what, name], how)
 
 
 def measure_horizons(terrain: TerrainParameters, points: int) -> Float64[np.ndarray, "points"]:

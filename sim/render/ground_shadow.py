@@ -13,7 +13,7 @@ from marsyard.sim.render.arrays import PeriodicGrid, Values, clip, larger, small
 from marsyard.sim.render.cones import Bounds
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.kernels import CASTER_UNIT_ROWS, sweep_shadow
-from marsyard.sim.render.sky import Sun
+from marsyard.sim.render.sky import Sun, disc_above
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.surface import HEIGHT, empty_aligned
@@ -156,12 +156,6 @@ def periodic_window(start: int, count: int, period: int) -> Int64[np.ndarray, "c
     entries = np.arange(count)
     samples = start + (entries - start) % count
     return np.asarray(samples % period)
-
-
-def disc_above(offset: Values) -> Values:
-    """Fraction of a disc above a straight line `offset` radii below its centre."""
-    offset = clip(offset, -1.0, 1.0)
-    return 0.5 + (offset * dr.sqrt(1.0 - offset * offset) + dr.asin(offset)) / dr.pi
 
 
 def march_to_sun(

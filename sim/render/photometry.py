@@ -43,8 +43,8 @@ class Law:
     ground_light: Values
     sky_light: SkyLight
 
-    def radiance(self, angles: Angles, normal: Values, sun_fraction: Values, blocked: Values) -> Values:
-        """Compute the radiance factor of a surface with albedo 1, of which the sun illuminates a fraction.
+    def radiance(self, angles: Angles, normal: Values, sunlight: Values, blocked: Values) -> Values:
+        """Compute the radiance factor of a surface with albedo 1, which receives a fraction of the direct sunlight.
 
         `blocked` are the vectors of the hidden sky (`obstructions`). Ground below a body that hides the sky is dark; it
         reflects less light by the same fraction.
@@ -52,7 +52,7 @@ class Law:
         cos_i, lunar = angles.cos_i, self.lunar_fraction
         surge = 1.0 + self.surge_amplitude / (1.0 + angles.tan_half_g / self.surge_width)
         disc = 2.0 * lunar * cos_i / (cos_i + angles.cos_e) + (1.0 - lunar) * cos_i
-        direct = dr.select(cos_i > 0.0, sun_fraction * self.normalisation * surge * disc, 0.0)
+        direct = dr.select(cos_i > 0.0, sunlight * self.normalisation * surge * disc, 0.0)
         diffuse = self.sky_light.irradiance(normal, blocked)
         ground_light = 0.5 * self.ground_light * (1.0 - smaller(blocked.z, 1.0))
         return direct + dr.fma(ground_light, 1.0 - normal.z, diffuse)
@@ -107,6 +107,10 @@ class Photometry:
             ground_light=Float(ground_light),
             sky_light=sky_light,
         )
+
+    def disc_fraction(self, sun: Sun) -> float:
+        """Fraction of direct sunlight that comes from the sun's disc; 1 under a uniform sky, which has no aureole."""
+        return 1.0 if self.sky is None else self.sky.disc_fraction(float(sun.direction[2]))
 
     def sky_model(self, sun: Sun) -> Sky:
         """Return the sky in pixels without ground."""

@@ -197,8 +197,8 @@ class Renderer:
 def shade_hits(scene: Scene, light: Light, terrain: Terrain, pose: Pose, rays: Rays, hits: Hits) -> ShadedImage:
     """Compute radiance, body and normal at the hits of rays."""
     geometry, materials = (terrain, pose, rays, hits), scene.materials
-    sun_fraction = visible_sun(*geometry, light.sun, light.sun_radius, scene.occluders, materials.objects)
-    return shade(*geometry, light, sun_fraction, materials)
+    visible = visible_sun(*geometry, light.sun, light.sun_radius, scene.occluders, materials.objects)
+    return shade(*geometry, light, visible, materials)
 
 
 def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> tuple[Values, Rays]:

@@ -21,6 +21,9 @@ ROVER_NAME = -3
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
+#: Sides of the bottom of the frustum that hides the sky, as a fraction of those of a rectangle around the wheels. Ray
+#: casting of all parts (`benchmarks.validation.sky_checks`) asks for less, the dark shadows of flown rovers for more.
+_SHELTER_BOTTOM = 0.9
 #: Left half of the deck's outline from front to rear, x and y as fractions of half its length and width: the solar
 #: panels of MER, with gaps between them (read from drawings of the press kit, accurate to about 5 %).
 _OUTLINE = (
@@ -93,11 +96,12 @@ def rover_objects(
         for material, solids in parts.items()
         for solid in solids
     ]
-    # The sky is hidden by a frustum, from a rectangle around the wheels at the body's bottom to one around the deck.
+    # The sky is hidden by a frustum, from a rectangle within the wheels at the body's bottom to one around the deck.
     # Parts outside of it (wheels, arm, equipment) hide about as much as its corners beyond body and panels.
     corners = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     deck_size = np.array([rover.body_length_m, rover.body_width_m])
     wheels = np.array([rover.front_m + rover.rear_m, 2.0 * rover.half_track_m]) + size[[0, 2]] * (2.0, 1.0)
+    wheels *= _SHELTER_BOTTOM
     bottom = np.column_stack([corners * wheels, np.full(4, rover.clearance_m)])
     top = np.column_stack([corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
     shelter = np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top])))

@@ -183,15 +183,16 @@ class Scene:
     @cached_property
     def occluders(self) -> Occluders:
         """Occluders of the sun."""
-        return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
+        return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint, self.among_objects)
 
     @cached_property
     def obstructions(self) -> Obstructions | None:
-        """Bodies that hide the sky from the ground around them; None from afar, where their effect is not visible."""
+        """Bodies that hide the sky and the aureole from the ground around them; None from afar."""
         mounds, shelter = self.objects.mounds, self.objects.shelter
         if not self.among_objects or (len(mounds) == 0 and shelter is None):
             return None
-        return Obstructions(Mounds.of(mounds), None if shelter is None else Shelter.of(shelter))
+        sun = np.asarray(self.sun.direction, dtype=np.float64)
+        return Obstructions(Mounds.of(mounds, sun), None if shelter is None else Shelter.of(shelter, sun))
 
     @cached_property
     def skyline(self) -> Skyline | None:
@@ -236,6 +237,7 @@ class Scene:
         return Light(
             Array3f64(*self.sun.direction.tolist()),
             Float64(self.sun.angular_radius_rad),
+            Float(photometry.disc_fraction(self.sun)),
             photometry.law(self.sun),
             self.photometry.sky_model(self.sun),
             Float64(self.caster_diameter_m) if self.caster_diameter_m > 0.0 else None,

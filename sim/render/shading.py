@@ -7,14 +7,14 @@ import drjit as dr
 from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, where
 from marsyard.sim.render.clouds import Clouds
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
-from marsyard.sim.render.obstructions import Obstructions
+from marsyard.sim.render.obstructions import Hidden, Obstructions
 from marsyard.sim.render.pebbles import PebbleField, pebble_surface
 from marsyard.sim.render.photometry import Angles, Law
 from marsyard.sim.render.primary import Hits, Points, locate
 from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.rock_surface import WEAR, RockSurface, dust_cover, rock_surface, texture_frame
-from marsyard.sim.render.shadows import ObjectSurfaces
-from marsyard.sim.render.sky import Sky
+from marsyard.sim.render.shadows import AUREOLE_BEHIND_BODY, ObjectSurfaces, VisibleLight
+from marsyard.sim.render.sky import Sky, disc_overlap
 from marsyard.sim.render.skyline import Skyline
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
@@ -29,12 +29,14 @@ GROUND, SKY = -1, -2
 class Light:
     """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and clouds.
 
-    `caster_diameter` is that of a round body at the camera, metres; None without one. `obstructions` hide the sky
-    from the ground, the `skyline` hides it in images.
+    `disc_fraction` of the direct sunlight comes from the sun's disc, the rest from its aureole. `caster_diameter` is
+    that of a round body at the camera, metres; None without one. `obstructions` hide the sky from the ground, the
+    `skyline` hides it in images.
     """
 
     sun: Values
     sun_radius: Values
+    disc_fraction: Values
     law: Law
     sky: Sky
     caster_diameter: Values | None
@@ -64,7 +66,7 @@ class Materials:
 class ShadedImage:
     """Radiance factor, body number (or `GROUND`, `SKY`) and unit normal in world axes of each pixel.
 
-    `sun_fraction` is the fraction of the sun's disc that ground and objects leave visible (`shadows.visible_sun`).
+    `sun_fraction` is the fraction of the sun's disc that ground and objects leave visible (`shadows.VisibleLight`).
     """
 
     radiance: Values
@@ -110,21 +112,11 @@ def _sample_ground(terrain: Terrain, points: Points, level: Values) -> _Surface:
     )[0]
 
 
-def disc_overlap(first: Values, second: Values, distance: Values) -> Values:
-    """Fraction of the second disc that the first disc covers, from their radii and the distance of their centres."""
-    alpha = dr.acos(clip((distance**2 + first**2 - second**2) / (2.0 * distance * first), -1.0, 1.0))
-    beta = dr.acos(clip((distance**2 + second**2 - first**2) / (2.0 * distance * second), -1.0, 1.0))
-    lens = first**2 * (alpha - 0.5 * dr.sin(2.0 * alpha)) + second**2 * (beta - 0.5 * dr.sin(2.0 * beta))
-    is_inside = distance <= dr.abs(first - second)
-    fraction = dr.select(is_inside, smaller((first / second) ** 2, 1.0), lens / (dr.pi * second**2))
-    return dr.select(distance >= first + second, 0.0, fraction)
-
-
 @compiled
 def shade(
-    terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, sun_fraction: Values, materials: Materials
+    terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, visible: VisibleLight, materials: Materials
 ) -> ShadedImage:
-    """Compute radiance factor, body and normal of every pixel; `sun_fraction` is that of `ShadedImage`."""
+    """Compute radiance factor, body and normal of every pixel."""
     points = locate(rays, pose, hits)
     is_object, is_ground = points.is_object, points.is_ground
     ground = _sample_ground(terrain, points, hits.level)
@@ -185,7 +177,7 @@ def shade(
     textures = materials.ground_texture, materials.object_texture
     albedo *= dr.exp(log_relative_albedo(*textures, is_object, texture_position, texture_footprint, strength))
     # a copy: products in place would change the fraction that is returned
-    fraction = Float(sun_fraction)
+    fraction = Float(visible.sun)
     if light.caster_diameter is not None:
         radius = 0.5 * light.caster_diameter / hits.distance
         fraction *= where(
@@ -193,18 +185,20 @@ def shade(
             lambda: 1.0 - Float(disc_overlap(radius, light.sun_radius, dr.acos(angles.cos_g))),
             Float(1.0),
         )
+    hidden = Hidden(Array3f(0.0), Float(0.0))
+    if light.obstructions is not None:
+        hidden = light.obstructions.hide_light(points.position, is_ground, is_object)
+    fraction = dr.lerp(visible.aureole * (1.0 - hidden.aureole), fraction, light.disc_fraction)
     if pebbles is not None:
         # the reflectance law includes the mean effect of all roughness
-        fraction *= (1.0 - pebbles.shadow) * (1.0 + pebbles.loss)
+        darkness = dr.lerp(1.0 - AUREOLE_BEHIND_BODY, 1.0, light.disc_fraction)
+        fraction *= (1.0 - darkness * pebbles.shadow) * (1.0 + darkness * pebbles.loss)
     if light.clouds is not None:
         fraction *= light.clouds.transmittance(points.position, light.sun)
     if slopes is not None:
         # on level ground the mean of n_z, 1 / sqrt(1 + slope**2), is 1 - variance to second order in the slope
         cosine = smaller(larger(angles.cos_i, 1e-6), 1.0)
         fraction *= (1.0 + slopes.resolved) * smith_shadowing(cosine, slopes.unresolved)
-    blocked = Array3f(0.0)
-    if light.obstructions is not None:
-        blocked = light.obstructions.hide_sky(points.position, is_ground, is_object)
-    radiance = albedo * light.law.radiance(angles, normal, fraction, blocked)
+    radiance = albedo * light.law.radiance(angles, normal, fraction, hidden.sky)
     radiance = where(~is_surface, lambda: light.sky_radiance(points.direction, rays.pixel_angles), radiance)
-    return ShadedImage(radiance, body, smooth_normal, sun_fraction)
+    return ShadedImage(radiance, body, smooth_normal, visible.sun)

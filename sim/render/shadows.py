@@ -1,4 +1,4 @@
-"""The fraction of the sun's disc that ground and objects leave visible at the points that rays meet."""
+"""The fractions of the sun's disc and of its aureole that ground and objects leave visible where rays meet surfaces."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from marsyard.sim.render.arrays import Values, compiled, larger, to_device, wher
 from marsyard.sim.render.casters import Casters, are_occluded
 from marsyard.sim.render.cones import Spheres
 from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
-from marsyard.sim.render.ground_shadow import COARSE_GRID_MARGIN, GroundShadow, disc_above, march_to_sun
+from marsyard.sim.render.ground_shadow import COARSE_GRID_MARGIN, GroundShadow, march_to_sun
 from marsyard.sim.render.primary import Hits, locate
 from marsyard.sim.render.rays import Pose, Rays
+from marsyard.sim.render.sky import AUREOLE_RADIUS_RAD, disc_above
 from marsyard.sim.render.spline import Terrain, evaluate
 
 #: Maximum number of cells along a side of a footprint.
 MAX_CELLS = 512
+#: Fraction of the aureole that a body leaves visible in its shadow, where its outline is not known: the mean over the
+#: shadow of a half sphere on the ground. It is 0.28 to 0.41 for suns between 20 and 75 deg (see the test).
+AUREOLE_BEHIND_BODY = 0.31
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +73,15 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class Occluders:
-    """Occluders of the sun: the ground's shadow, the objects' triangles, and the region that objects may shade."""
+    """Occluders of the sun: the ground's shadow, the objects' triangles, and the region that objects may shade.
+
+    `knows_outlines`: whether the bodies that shade the ground are also `obstructions`, which hide the aureole from it.
+    """
 
     shadow: GroundShadow | None
     casters: Casters | None
     footprint: Footprint | None
+    knows_outlines: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +106,24 @@ class ObjectSurfaces:
         return dr.normalize(normal)
 
 
+@dataclass(frozen=True, eq=False)
+class VisibleLight:
+    """Fractions of the sun's disc, and of its aureole, that ground and objects leave visible from each point.
+
+    The aureole behind bodies with a known outline (`obstructions`) is not yet subtracted.
+    """
+
+    sun: Values
+    aureole: Values
+
+
 @compiled
 def _shade_by_grid(
     terrain: Terrain, shadow: GroundShadow, pose: Pose, rays: Rays, hits: Hits, radius: Values
-) -> tuple[Values, Values]:
-    """Compute the fraction of the sun above the ground from the shadow's grid, and mark where it is too coarse.
+) -> tuple[VisibleLight, Values]:
+    """Compute the visible light above the ground from the shadow's grid, and mark where it is too coarse for the sun.
 
-    On the finest level the edge of a shadow needs rays to the sun.
+    On the finest level the edge of a shadow needs rays to the sun. The ground is a straight line across the aureole.
     """
     points = locate(rays, pose, hits)
     x, y, z = points.position
@@ -117,7 +136,9 @@ def _shade_by_grid(
     margin = COARSE_GRID_MARGIN * Float(shadow.spacing) + half_penumbra
     fraction = dr.select(clearance <= -margin, Float(0.0), 1.0)
     fraction = dr.select(is_finest, fraction, disc_above(clearance / half_penumbra))
-    return fraction, is_finest & (dr.abs(clearance) < margin)
+    half_aureole = shadow.half_penumbra(Float(AUREOLE_RADIUS_RAD), 0.0, rows)
+    aureole = dr.select(half_aureole > 0.0, disc_above(clearance / half_aureole), 1.0)
+    return VisibleLight(fraction, aureole), is_finest & (dr.abs(clearance) < margin)
 
 
 @compiled
@@ -149,14 +170,14 @@ def _mark_shaded_region(pose: Pose, rays: Rays, hits: Hits, fraction: Values, fo
 @compiled
 def _shade_by_objects(
     casters: Casters, objects: ObjectSurfaces, pose: Pose, rays: Rays, hits: Hits, pixel: Values
-) -> Values:
-    """Return whether objects hide the sun in some pixels."""
+) -> tuple[Values, Values]:
+    """Return whether objects hide the sun in some pixels, and whether these pixels show objects."""
     rays, hits = rays.select(pixel), hits.select(pixel)
     points = locate(rays, pose, hits)
     normal = where(points.is_object, lambda: objects.normal_at(hits, points.is_object), Array3f(0.0, 0.0, 1.0))
     # an offset along the normal, m (objects: plus 5 % of a pixel); rounding could let a facet shade itself
     offset = 1e-4 + dr.select(points.is_object, 0.05 * Float(hits.distance) * rays.pixel_angles, 0.0)
-    return are_occluded(casters, points.position + Array3f64(offset * normal), Bool(True))
+    return are_occluded(casters, points.position + Array3f64(offset * normal), Bool(True)), points.is_object
 
 
 def visible_sun(
@@ -168,18 +189,22 @@ def visible_sun(
     radius: Values,
     occluders: Occluders,
     objects: ObjectSurfaces | None,
-) -> Values:
-    """Compute the fraction of the sun's disc, with this angular radius, that ground and objects leave visible."""
-    fraction = dr.full(Float, 1.0, dr.width(hits.distance))
+) -> VisibleLight:
+    """Compute the visible fractions of the sun's disc, which has this angular radius, and of its aureole."""
+    pixels = dr.width(hits.distance)
+    visible = VisibleLight(dr.full(Float, 1.0, pixels), dr.full(Float, 1.0, pixels))
     if occluders.shadow is not None:
-        fraction, is_uncertain = _shade_by_grid(terrain, occluders.shadow, pose, rays, hits, radius)
+        visible, is_uncertain = _shade_by_grid(terrain, occluders.shadow, pose, rays, hits, radius)
         pixel = dr.compress(is_uncertain)
         if len(pixel) > 0:
             marched = _shade_by_rays(terrain, occluders.shadow, pose, rays, hits, sun, radius, pixel)
-            dr.scatter(fraction, marched, pixel)
+            dr.scatter(visible.sun, marched, pixel)
     if occluders.casters is not None and objects is not None:
-        pixel = dr.compress(_mark_shaded_region(pose, rays, hits, fraction, occluders.footprint))
+        pixel = dr.compress(_mark_shaded_region(pose, rays, hits, visible.sun, occluders.footprint))
         if len(pixel) > 0:
-            is_hidden = _shade_by_objects(occluders.casters, objects, pose, rays, hits, pixel)
-            dr.scatter(fraction, Float(0.0), pixel, is_hidden)
-    return fraction
+            is_hidden, is_object = _shade_by_objects(occluders.casters, objects, pose, rays, hits, pixel)
+            dr.scatter(visible.sun, Float(0.0), pixel, is_hidden)
+            is_unknown = is_hidden & is_object if occluders.knows_outlines else is_hidden
+            aureole = AUREOLE_BEHIND_BODY * dr.gather(Float, visible.aureole, pixel, is_unknown)
+            dr.scatter(visible.aureole, aureole, pixel, is_unknown)
+    return visible

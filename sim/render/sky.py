@@ -14,13 +14,17 @@ from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 from scipy.special import expn
 
-from marsyard.sim.render.arrays import Values, clip, compiled, larger, to_device, to_host
+from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, to_device, to_host
 from marsyard.sim.render.device import Array3f, Float, Float64
+from marsyard.sim.terrain.environment import MIN_SUN_SINE
 
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305
 #: Sine of the elevation below which the sky's brightness is constant.
 MIN_ELEVATION_SINE = 1e-3
+#: Angular radius of the aureole, a uniform disc around the sun, radians. In the simulation of scattering
+#: (`benchmarks.validation.air_checks`) half of its light comes from within 16 to 17 deg, for all suns and depths.
+AUREOLE_RADIUS_RAD = 0.42
 
 
 @dataclass(frozen=True)
@@ -104,13 +108,30 @@ class Sky:
         return self.diffuse * layer + scattered + disc_fraction / (sun_radius**2 + pixel_rad**2 / 12.0)
 
 
+def disc_above(offset: Values) -> Values:
+    """Fraction of a disc above a straight line `offset` radii below its centre."""
+    offset = clip(offset, -1.0, 1.0)
+    return 0.5 + (offset * dr.sqrt(1.0 - offset * offset) + dr.asin(offset)) / dr.pi
+
+
+def disc_overlap(first: Values, second: Values, distance: Values) -> Values:
+    """Fraction of the second disc that the first disc covers, from their radii and the distance of their centres."""
+    alpha = dr.acos(clip((distance**2 + first**2 - second**2) / (2.0 * distance * first), -1.0, 1.0))
+    beta = dr.acos(clip((distance**2 + second**2 - first**2) / (2.0 * distance * second), -1.0, 1.0))
+    lens = first**2 * (alpha - 0.5 * dr.sin(2.0 * alpha)) + second**2 * (beta - 0.5 * dr.sin(2.0 * beta))
+    is_inside = distance <= dr.abs(first - second)
+    fraction = dr.select(is_inside, smaller((first / second) ** 2, 1.0), lens / (dr.pi * second**2))
+    return dr.select(distance >= first + second, 0.0, fraction)
+
+
 def single_scattering(mu: Values, mu0: Values, cos_g: Values, depth: Values, asymmetry: Values) -> Values:
     """Single-scattering radiance of a plane air layer from below, relative to direct sunlight, up to a factor.
 
     ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P and the
-    optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun.
+    optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun; at a lower sun than
+    that of `MIN_SUN_SINE`, direct sunlight is so weak that the ratio would overflow.
     """
-    mu, mu0 = larger(mu, MIN_ELEVATION_SINE), larger(mu0, MIN_ELEVATION_SINE)
+    mu, mu0 = larger(mu, MIN_ELEVATION_SINE), larger(mu0, MIN_SUN_SINE)
     # the limit for equal elevations avoids 0 / 0
     difference = depth / mu - depth / mu0
     path = dr.select(dr.abs(difference) < 1e-6, 1.0 - 0.5 * difference, (1.0 - dr.exp(-difference)) / difference)
@@ -154,7 +175,7 @@ class DustySky:
     with the Henyey-Greenstein phase function P, optical depth tau, single-scattering albedo w, mean cosine g of the
     scattering angle, and the sines of elevation mu of the view and mu0 of the sun. The extinction depth is
     ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, is part of the direct sunlight
-    (Joseph et al. 1976). Light scattered several times is isotropic: it adds ``J (1 - exp(-t / mu))``, so that the
+    (Joseph et al. 1976), in which it is the aureole around the disc. Light scattered several times is isotropic: it adds ``J (1 - exp(-t / mu))``, so that the
     irradiance of level ground without the peak is `Photometry.sky_fraction`. If single scattering exceeds this
     irradiance, it is scaled down.
     """
@@ -177,6 +198,10 @@ class DustySky:
     def depth(self) -> float:
         """Extinction depth t."""
         return (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
+
+    def disc_fraction(self, sun_z: float) -> float:
+        """Fraction of direct sunlight that comes from the sun's disc; the rest comes from the aureole."""
+        return float(np.exp((self.depth - self.optical_depth) / max(sun_z, MIN_SUN_SINE)))
 
     def model(self, sun_z: float, sky_fraction: float) -> Sky:
         """Return the sky whose irradiance without the forward peak is `sky_fraction`."""

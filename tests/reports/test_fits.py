@@ -96,7 +96,7 @@ def test_tables_with_fitted_values_are_registered() -> None:
 def test_comparisons_with_data_of_fits_are_no_validation() -> None:
     """Data of validation rows are registered, or are those to which no constant was fitted."""
     rows = [row for check in read_checks().values() for row in check.rows if row.conditions.data]
-    predicted = {"dimes-templates", "sky-images", "hazard-images"}
+    predicted = {"dimes-templates", "sky-images"}
     assert {row.conditions.data for row in rows} <= fitted_data() | predicted
     for row in rows:
         assert row.kind is (RowKind.VALIDATION if row.conditions.data in predicted else RowKind.FIT), row.claim

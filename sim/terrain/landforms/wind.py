@@ -43,8 +43,10 @@ class Dunes(Parameters):
         waves_per_side = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
         whole_waves = np.round(waves_per_side)
         if not whole_waves.any():
-            side = f"{ground.period_m:g} m"
-            raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
+            raise ValueError(
+                f"the wavelength_m of dunes, ripples or bedforms is {self.wavelength_m:g}; it must be shorter than the "
+                f"terrain's side, {ground.period_m:g} m"
+            )
         wave_vector = 2.0 * np.pi * whole_waves / ground.period_m
         # amplitudes of the fields fall to 1/e at the wavenumber 2 / length
         across_m, along_m = (

@@ -84,16 +84,20 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
 
 @pytest.mark.slow
 def test_rover_drives_around_an_obstacle_in_its_images() -> None:
+    """No rover comes near the obstacle; holes of the map stop most of them in front of it (NO_PATH)."""
     leg = {"motion": "approach", "goal_m": 2.0, "autonav": True}
-    # with most seeds, the holes of the map stop the rover in front of the obstacle (NO_PATH)
-    run = run_slipping_rover(9, legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
-    rocks = run.setup.world.rocks
-    rock_m = rocks.position_m[rocks.names["obstacle-1"], :2]
-    path = [stance for stop in run.stops for drive in stop.drives for stance in drive.stances]
-    closest_m = min(float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m))) for stance in path)
-    assert run.outcome.name == "COMPLETED"
-    # The circle around all wheels has a radius of 0.6 m.
-    assert closest_m > 0.6 + 0.5 * OBSTACLE["diameter_m"] - 0.05
+    outcomes = set()
+    for seed in range(1, 7):
+        run = run_slipping_rover(seed, legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
+        outcomes.add(run.outcome.name)
+        rocks = run.setup.world.rocks
+        rock_m = rocks.position_m[rocks.names["obstacle-1"], :2]
+        for stance in (stance for stop in run.stops for drive in stop.drives for stance in drive.stances):
+            # The circle around all wheels has a radius of 0.6 m.
+            distance_m = float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m)))
+            assert distance_m > 0.6 + 0.5 * OBSTACLE["diameter_m"] - 0.05
+    assert "COMPLETED" in outcomes
+    assert outcomes <= {"COMPLETED", "NO_PATH"}
 
 
 def test_oracles_need_no_navigation_cameras() -> None:

@@ -192,7 +192,7 @@ def test_landforms_on_a_coarser_grid_have_the_same_position() -> None:
 @pytest.mark.parametrize(
     ("invalid", "message"),
     [
-        ({"dunes": Dunes(wavelength_m=5000.0)}, r"dunes\.wavelength_m is 5000"),
+        ({"dunes": Dunes(wavelength_m=5000.0)}, r"wavelength_m of dunes, ripples or bedforms is 5000"),
         ({"ramp": Ramp(length_m=2000.0)}, r"ramp\.length_m is 2000"),
     ],
 )
