@@ -1,4 +1,8 @@
-"""Task of the estimators of landing sites, and the format of their answers in tables."""
+"""Task of the estimators of landing sites, and the format of their answers in tables.
+
+Two systems evaluate this task, helicopter landings and recorded images. It is therefore a common module, as that of the
+velocity estimators (ADR 39).
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -10,13 +14,20 @@ from marsyard.algorithms.hda.options import IMPROVEMENTS
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.tasks import Task, variants
+from marsyard.sim.measurements import LandingMeasurements
+
+
+def _create_refusal(measurements: LandingMeasurements) -> SiteEstimate:
+    """Create the refusal of a run that only exports its inputs: an algorithm without a map keeps the a-priori site."""
+    return SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
+
 
 #: Format of a table of landing sites.
 SITE_FORMAT = AnswerFormat(
     form=exchange.SITE_FORM,
     numbers={"site_world": ("site_east_m", "site_north_m", "site_up_m")},
     required=("site_world",),
-    create_empty=lambda measurements: SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world),
+    create_refusal=_create_refusal,
 )
 LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",

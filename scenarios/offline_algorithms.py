@@ -36,7 +36,7 @@ class AnswerFormat(Generic[Answer]):
     - numbers: columns of each key of the form. A square matrix is symmetric, and its columns are those of its upper
       triangle, row by row. A row contains all numbers of a key, or none.
     - required: keys whose columns each table contains
-    - create_empty: creates the refusal that an export returns
+    - create_refusal: creates the refusal that an export returns
     - note: explanation of the columns for the user
     - write_inputs: writes the inputs of a case into an existing folder. Raises OSError.
     - join: joins the answers in the lines of a case, in the order of the table; None: a case has one line. Raises
@@ -46,7 +46,7 @@ class AnswerFormat(Generic[Answer]):
     form: AnswerForm[Answer]
     numbers: Mapping[str, tuple[str, ...]]
     required: tuple[str, ...]
-    create_empty: Callable[[Any], Any]
+    create_refusal: Callable[[Any], Any]
     note: str = ""
     write_inputs: Callable[[Path, Any], None] = lambda folder, inputs: write_case(folder, inputs, image_format="png")
     join: Callable[[Sequence[Answer]], Any] | None = None
@@ -184,7 +184,7 @@ class CaseExporter:
         self.answer_format.write_inputs(temporary_folder, measurements)
         shutil.rmtree(self.folder, ignore_errors=True)
         temporary_folder.rename(self.folder)
-        return self.answer_format.create_empty(measurements)
+        return self.answer_format.create_refusal(measurements)
 
 
 @dataclass(frozen=True)

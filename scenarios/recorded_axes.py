@@ -21,7 +21,18 @@ _QUATERNION_TOLERANCE = 1e-3
 
 
 class RecordedAxes(Parameters):
-    """Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
+    """Axes of recorded poses, and mounting of the camera in the recorded vehicle.
+
+    A file contains attitudes of a vehicle: rotations from the vehicle's axes to the axes of its world. The attitude of
+    the body, whose camera looks along -z, is the product
+    ``enu_from_body = enu_from_axes * axes_from_vehicle * vehicle_from_mounted * mounted_from_body``:
+
+    - enu_from_axes: from the axes of the file's world (key `axes`)
+    - axes_from_vehicle: the file's quaternion
+    - vehicle_from_mounted: `mounting`, from the camera or the body (key `attitude_of`) to the vehicle. It is the
+      identity by default. The file's attitudes are then those of the camera or the body.
+    - mounted_from_body: the identity for the body, else from the body to OpenCV's camera axes
+    """
 
     axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
     attitude_of: Annotated[

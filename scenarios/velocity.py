@@ -36,7 +36,7 @@ VELOCITY_FORMAT = AnswerFormat(
         "span_s": ("start_s", "end_s"),
     },
     required=("velocity_m_s",),
-    create_empty=lambda _: VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
+    create_refusal=lambda _: VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
     note="A velocity is the mean between the last two images, or between the time tags `start_s` and `end_s`.",
 )
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(

@@ -24,7 +24,7 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Frame, Photometry, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend
-from marsyard.sim.render.texture import MicroRelief, octave_heights
+from marsyard.sim.render.micro_relief import MicroRelief, octave_heights
 from marsyard.sim.sensor import CameraDesign, ImageMotion
 from marsyard.sim.terrain import RockField, Site, Surface, TerrainBank, TerrainParameters
 

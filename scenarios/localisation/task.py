@@ -70,7 +70,7 @@ POSITION_FORMAT = AnswerFormat(
         "covariance": tuple(f"covariance_{row}_{column}" for row, column in zip(*np.triu_indices(9), strict=True)),
     },
     required=("time_s",),
-    create_empty=_create_refusals,
+    create_refusal=_create_refusals,
     note=(
         "A descent has one line for each image, in the order of the images, and a last line for the end of the\n"
         "inertial data. All lines have `time_s`; lines with the outcome VALID have all other numbers, lines with\n"

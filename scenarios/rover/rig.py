@@ -20,9 +20,6 @@ class Rig:
     """Simulated mast and stereo pair with sampled errors: true values, calibrated values, and current mast angles."""
 
     head: StereoHead  #: true and calibrated stereo pair
-    calibrated: MastCalibration  #: calibration known to the flight software
-    left: CameraModel  #: true left camera in the head's frame
-    right: CameraModel  #: true right camera in the head's frame
     mast: Mast
     state: MastState  #: current angles: true, and read by the encoders
     motor_stream: np.random.Generator  #: random stream of the motors' stopping errors
@@ -33,8 +30,22 @@ class Rig:
         design = p.camera.mast()
         head = StereoHead.draw(design, p.stereo, streams.generator("stereo calibration"))
         mast = Mast.draw(p.pointing, design.geometry, streams.generator("mast zeros"))
-        left, right, motor_stream = head.true.left, head.true.right, streams.generator("mast motors")
-        return cls(head, head.calibrated, left, right, mast, mast.rest, motor_stream)
+        return cls(head, mast, mast.rest, streams.generator("mast motors"))
+
+    @property
+    def calibrated(self) -> MastCalibration:
+        """Calibration known to the flight software."""
+        return self.head.calibrated
+
+    @property
+    def left(self) -> CameraModel:
+        """True left camera in the head's frame."""
+        return self.head.true.left
+
+    @property
+    def right(self) -> CameraModel:
+        """True right camera in the head's frame."""
+        return self.head.true.right
 
     @property
     def pixel_rad(self) -> float:
@@ -58,7 +69,7 @@ class Rig:
         if self.state.readings_rad != (azimuth_rad, elevation_rad):
             self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motor_stream)
 
-    def range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
-        """Compute the estimated distance of a position from the left camera."""
+    def estimated_range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
+        """Estimate the distance of a position from the left camera by the calibration and the encoder readings."""
         camera = self.calibrated.left.transform(self.calibrated.geometry.rover_from_head(*self.state.readings_rad))
         return float(np.linalg.norm(position_rover - camera.c))

@@ -176,4 +176,4 @@ class RoverRun:
     def create_target_estimate(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
         """Create a target estimate from a position in the rover frame; add its range from the camera."""
         position = np.asarray(position_rover)
-        return TargetEstimate(position, self.setup.rig.range_m(position))
+        return TargetEstimate(position, self.setup.rig.estimated_range_m(position))

@@ -1,4 +1,4 @@
-"""Arrays of Dr.Jit: compiled functions over them, selections, exchange with NumPy, and periodic grids.
+"""Arrays of Dr.Jit: compiled functions over them, selections, and exchange with NumPy.
 
 A function over Dr.Jit arrays is traced once and compiled to one program, which then processes all pixels. The compiled
 programs are stored in the cache folder; their names are hashes of their instructions, so they are never outdated.
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import update_wrapper
 from typing import Any
 
@@ -91,48 +90,12 @@ def to_device(kind: Any, values: NDArray[Any] | float, *, share: bool = False) -
 
 
 def vectors_to_device(kind: Any, vectors: NDArray[Any]) -> Values:
-    """Copy vectors, shape (n, 3), to an array of vectors."""
+    """Copy n vectors of k components, shape (n, k), to an array of the vector type `kind`."""
     return kind(*(to_device(dr.value_t(kind), vectors[:, axis]) for axis in range(vectors.shape[1])))
 
 
 def to_host(values: Values) -> NDArray[Any]:
-    """Return the computed numbers as an array of NumPy; vectors have the shape (n, 3)."""
+    """Return the computed numbers as an array of NumPy; vectors of k components have the shape (n, k)."""
     if dr.depth_v(values) == 1:
         return np.asarray(values.numpy())
     return np.asarray(dr.ravel(values).numpy()).reshape(-1, len(values))
-
-
-@dataclass(frozen=True, eq=False)
-class PeriodicGrid:
-    """A periodic grid of numbers, row by row, whose side is a power of two; y increases with the row.
-
-    - per_metre: cells per metre; the first number is at x = y = 0
-    """
-
-    values: Values
-    log2_side: Values
-    per_metre: Values
-
-    @classmethod
-    def of(cls, values: np.ndarray, per_metre: float, *, share: bool = False) -> PeriodicGrid:
-        """Copy a grid, shape (side, side), to the device."""
-        kind = UInt8 if values.dtype == np.uint8 else Float
-        side = len(values)
-        return cls(to_device(kind, values, share=share), UInt32(side.bit_length() - 1), Float64(per_metre))
-
-    def neighbours(self, x: Values, y: Values, active: Values) -> tuple[list[Values], Values, Values]:
-        """Return the values south-west, south-east, north-west, north-east of positions, and fractions of a cell."""
-        grid_x, grid_y = x * self.per_metre, y * self.per_metre
-        floor_x, floor_y = dr.floor(grid_x), dr.floor(grid_y)
-        column, row, last = Int32(floor_x), Int32(floor_y), Int32((UInt32(1) << self.log2_side) - 1)
-        columns = [UInt32((column + offset) & last) for offset in (0, 1)]
-        lines = [UInt32((row + offset) & last) << self.log2_side for offset in (0, 1)]
-        values = [dr.gather(type(self.values), self.values, line + j, active) for line in lines for j in columns]
-        return values, grid_x - floor_x, grid_y - floor_y
-
-    def interpolate(self, x: Values, y: Values, active: Values = True, kind: Any = Float) -> Values:
-        """Interpolate the grid bilinearly at positions, metres, with single or double precision."""
-        corners, fraction_x, fraction_y = self.neighbours(x, y, active)
-        south_west, south_east, north_west, north_east = map(kind, corners)
-        fx, fy = kind(fraction_x), kind(fraction_y)
-        return dr.lerp(dr.lerp(south_west, south_east, fx), dr.lerp(north_west, north_east, fx), fy)

@@ -14,8 +14,9 @@ from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.render.arrays import PeriodicGrid, Values, larger
+from marsyard.sim.render.arrays import Values, larger
 from marsyard.sim.render.device import Float, Float64
+from marsyard.sim.render.periodic_grid import PeriodicGrid
 from marsyard.sim.render.sky import Sun
 
 #: Cells along each side of the periodic layer, and its period divided by the mean cloud size.

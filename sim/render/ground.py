@@ -2,6 +2,10 @@
 
 All distances are along the ray, in metres. A search is needed for rays that graze the ground: the mesh that gives the
 guess does not resolve every crest.
+
+The argument `level` of the functions is the terrain level on which a ray is traced: 0 is the finest level of the
+pyramid of samples (`spline.Terrain`), and each further level has twice the distance between samples. Each ray has its
+own level, which follows from the footprint of its pixel.
 """
 
 from dataclasses import dataclass, replace
@@ -227,11 +231,19 @@ def first_crossing(
     def advance(
         previous: Clearance, current: Clearance, t: Values, has_skipped: Values, is_active: Values
     ) -> tuple[Clearance, Clearance, Values, Values, Values]:
+        """Take a step of the search.
+
+        - previous, current: clearances at the ends of the last step; 0 at the start of the search. A successful search
+          ends with the ray above the ground at `previous` and below it at `current`.
+        - t: distance of the sample that this step takes; at the end, that of the last sample
+        - has_skipped: whether the step from `current` to `t` passes above whole blocks, which contain no crest
+        - is_active: whether the search continues. It ends at a crossing, at `farthest`, or if the ray passes above all
+          blocks before `farthest`.
+        """
         new = clearance_at(terrain, level, ray, t, is_active)
         may_have_crest = is_active & (new.height >= 0.0) & ~has_skipped & (current.rate < 0.0) & (new.rate > 0.0)
         crest = find_occluding_crest(terrain, level, ray, current, new, may_have_crest)
         new = dr.select(may_have_crest & (crest.height < 0.0), crest, new)
-        # the ray is above the ground at `previous`, and below it at `current` if the search has succeeded
         previous, current = current, new
         is_active &= (new.height >= 0.0) & (t < farthest)
         step = larger(spacing, MIN_STEP_FRACTION * t)

@@ -9,10 +9,11 @@ import drjit as dr
 import numpy as np
 from jaxtyping import Int64
 
-from marsyard.sim.render.arrays import PeriodicGrid, Values, clip, larger, smaller
+from marsyard.sim.render.arrays import Values, clip, larger, smaller
 from marsyard.sim.render.cones import Bounds
 from marsyard.sim.render.device import Float, Float64, UInt32
-from marsyard.sim.render.kernels import CASTER_UNIT_ROWS, sweep_shadow
+from marsyard.sim.render.kernels.ground_shadow import CASTER_UNIT_ROWS, sweep_shadow
+from marsyard.sim.render.periodic_grid import PeriodicGrid
 from marsyard.sim.render.sky import Sun, disc_above
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.terrain import Surface

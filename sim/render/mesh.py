@@ -7,7 +7,7 @@ from jaxtyping import Float64, Int, UInt32
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
-from marsyard.sim.render.kernels import build_mesh, spans_in_hull
+from marsyard.sim.render.kernels.mesh import build_mesh, spans_in_hull
 from marsyard.sim.render.scene import Scene
 from marsyard.sim.terrain import Surface
 

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from jaxtyping import Int32 as IntArray
 
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, where
-from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
 from marsyard.sim.render.ground import MAX_CHANGE, Extent, refine, search_grazing_ray
 from marsyard.sim.render.pixel_rays import PixelRays
 from marsyard.sim.render.rays import Pose, Ray, Rays
@@ -93,6 +93,16 @@ class Hits:
     def select(self, index: Values) -> Hits:
         """Return the hits of some rays."""
         return Hits(*(dr.gather(type(values), values, index) for values in vars(self).values()))
+
+    def interpolate_normal(self, corner_normals: Values, active: Values) -> Values:
+        """Interpolate the unit normals at the corners of the triangles that are hit.
+
+        `corner_normals` contains three normals per triangle, in the order of the triangles.
+        """
+        normal, corner = Array3f(0.0), 3 * UInt32(self.triangle)
+        for k, weight in enumerate((1.0 - self.second - self.third, self.second, self.third)):
+            normal += weight * dr.gather(Array3f, corner_normals, corner + k, active)
+        return dr.normalize(normal)
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,7 +197,8 @@ class Renderer:
 def shade_hits(scene: Scene, light: Light, terrain: Terrain, pose: Pose, rays: Rays, hits: Hits) -> ShadedImage:
     """Compute radiance, body and normal at the hits of rays."""
     geometry, materials = (terrain, pose, rays, hits), scene.materials
-    visible = visible_sun(*geometry, light.sun, light.sun_radius, scene.occluders, materials.objects)
+    corner_normals = None if materials.objects is None else materials.objects.corner_normals
+    visible = visible_sun(*geometry, light.sun, light.sun_radius, scene.occluders, corner_normals)
     return shade(*geometry, light, visible, materials)
 
 

@@ -16,17 +16,18 @@ from marsyard.sim.render.cones import Bounds, Cone, ground_in_cones, potentially
 from marsyard.sim.render.device import Array3f, Array3f64, Float, Float64, Int32
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.micro_relief import MicroRelief, RoughGround
 from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.obstructions import MOUND_RANGE, Mounds, Obstructions, Shelter
 from marsyard.sim.render.pebbles import PebbleField
 from marsyard.sim.render.photometry import Photometry
 from marsyard.sim.render.rock_surface import describe_grain
-from marsyard.sim.render.shading import Light, Materials
-from marsyard.sim.render.shadows import Footprint, ObjectSurfaces, Occluders
+from marsyard.sim.render.shading import Light, Materials, ObjectSurfaces
+from marsyard.sim.render.shadows import Footprint, Occluders
 from marsyard.sim.render.sky import Sun
 from marsyard.sim.render.skyline import Relief, Skyline
 from marsyard.sim.render.spline import Terrain
-from marsyard.sim.render.texture import MicroRelief, RoughGround, Texture
+from marsyard.sim.render.texture import Texture
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.sites import SitePebbles
 from marsyard.sim.terrain.surface import HEIGHT, UNIFORM

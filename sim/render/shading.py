@@ -7,17 +7,18 @@ import drjit as dr
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
 from marsyard.sim.render.clouds import Clouds
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.micro_relief import RoughGround, relief_slopes, smith_shadowing
 from marsyard.sim.render.obstructions import Hidden, Obstructions
 from marsyard.sim.render.pebbles import PebbleField, pebble_surface
 from marsyard.sim.render.photometry import Angles, Law
 from marsyard.sim.render.primary import Hits, Points, locate
 from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.rock_surface import WEAR, RockSurface, dust_cover, rock_surface, texture_frame
-from marsyard.sim.render.shadows import AUREOLE_BEHIND_BODY, ObjectSurfaces, VisibleLight
+from marsyard.sim.render.shadows import AUREOLE_BEHIND_BODY, VisibleLight
 from marsyard.sim.render.sky import Sky, disc_overlap
 from marsyard.sim.render.skyline import Skyline
 from marsyard.sim.render.spline import Terrain, evaluate
-from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
+from marsyard.sim.render.texture import Octaves, log_relative_albedo
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
 MAX_SHARP_FOOTPRINT = 1.2
@@ -49,6 +50,21 @@ class Light:
         cos_g = dr.dot(direction, self.sun)
         sky = Float(self.sky.radiance(self.sun.z, self.sun_radius, direction.z, cos_g, Float64(pixel_rad)))
         return sky if self.skyline is None else self.skyline.cover(sky, direction, self.law, self.sun, pixel_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSurfaces:
+    """Normals at the corners of all triangles, body of each triangle, and albedo of each body.
+
+    `dust_albedo` is that of a body's level faces, `grain` that of `rock_surface.describe_grain`, of size 0 for
+    bodies without grain.
+    """
+
+    corner_normals: Values
+    body_of_triangle: Values
+    albedo: Values
+    dust_albedo: Values
+    grain: Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +140,7 @@ def shade(
     strength, texture_position = Float(1.0), Array3f64(points.position)
     body, texture_footprint = dr.select(is_ground, Int32(GROUND), SKY), dr.select(is_ground, points.footprint, dr.inf)
     if materials.objects is not None:
-        object_normal = materials.objects.normal_at(hits, is_object)
+        object_normal = hits.interpolate_normal(materials.objects.corner_normals, is_object)
         normal = dr.select(is_object, object_normal, normal)
         object_body = dr.gather(Int32, materials.objects.body_of_triangle, UInt32(hits.triangle), is_object)
         body = dr.select(is_object, object_body, body)

@@ -85,28 +85,6 @@ class Occluders:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectSurfaces:
-    """Normals at the corners of all triangles, body of each triangle, and albedo of each body.
-
-    `dust_albedo` is that of a body's level faces, `grain` that of `rock_surface.describe_grain`, of size 0 for
-    bodies without grain.
-    """
-
-    normals: Values
-    body_of_triangle: Values
-    albedo: Values
-    dust_albedo: Values
-    grain: Values
-
-    def normal_at(self, hits: Hits, active: Values) -> Values:
-        """Interpolate the unit normals at the corners of the triangles that are hit."""
-        normal, corner = Array3f(0.0), 3 * UInt32(hits.triangle)
-        for k, weight in enumerate((1.0 - hits.second - hits.third, hits.second, hits.third)):
-            normal += weight * dr.gather(Array3f, self.normals, corner + k, active)
-        return dr.normalize(normal)
-
-
-@dataclass(frozen=True, eq=False)
 class VisibleLight:
     """Fractions of the sun's disc, and of its aureole, that ground and objects leave visible from each point.
 
@@ -150,10 +128,10 @@ def _shade_by_rays(
     hits: Hits,
     sun: Values,
     radius: Values,
-    pixel: Values,
+    pixel_indices: Values,
 ) -> Values:
     """Compute the fraction of the sun above the ground in some pixels by rays to the sun."""
-    points = locate(rays.select(pixel), pose, hits.select(pixel))
+    points = locate(rays.select(pixel_indices), pose, hits.select(pixel_indices))
     return march_to_sun(terrain, shadow, points.position, sun, radius, Bool(True))
 
 
@@ -169,12 +147,14 @@ def _mark_shaded_region(pose: Pose, rays: Rays, hits: Hits, fraction: Values, fo
 
 @compiled
 def _shade_by_objects(
-    casters: Casters, objects: ObjectSurfaces, pose: Pose, rays: Rays, hits: Hits, pixel: Values
+    casters: Casters, corner_normals: Values, pose: Pose, rays: Rays, hits: Hits, pixel_indices: Values
 ) -> tuple[Values, Values]:
     """Return whether objects hide the sun in some pixels, and whether these pixels show objects."""
-    rays, hits = rays.select(pixel), hits.select(pixel)
+    rays, hits = rays.select(pixel_indices), hits.select(pixel_indices)
     points = locate(rays, pose, hits)
-    normal = where(points.is_object, lambda: objects.normal_at(hits, points.is_object), Array3f(0.0, 0.0, 1.0))
+    normal = where(
+        points.is_object, lambda: hits.interpolate_normal(corner_normals, points.is_object), Array3f(0.0, 0.0, 1.0)
+    )
     # an offset along the normal, m (objects: plus 5 % of a pixel); rounding could let a facet shade itself
     offset = 1e-4 + dr.select(points.is_object, 0.05 * Float(hits.distance) * rays.pixel_angles, 0.0)
     return are_occluded(casters, points.position + Array3f64(offset * normal), Bool(True)), points.is_object
@@ -188,23 +168,26 @@ def visible_sun(
     sun: Values,
     radius: Values,
     occluders: Occluders,
-    objects: ObjectSurfaces | None,
+    corner_normals: Values | None,
 ) -> VisibleLight:
-    """Compute the visible fractions of the sun's disc, which has this angular radius, and of its aureole."""
+    """Compute the visible fractions of the sun's disc, which has this angular radius, and of its aureole.
+
+    `corner_normals` are the normals at the corners of all triangles of objects; None without objects.
+    """
     pixels = dr.width(hits.distance)
     visible = VisibleLight(dr.full(Float, 1.0, pixels), dr.full(Float, 1.0, pixels))
     if occluders.shadow is not None:
         visible, is_uncertain = _shade_by_grid(terrain, occluders.shadow, pose, rays, hits, radius)
-        pixel = dr.compress(is_uncertain)
-        if len(pixel) > 0:
-            marched = _shade_by_rays(terrain, occluders.shadow, pose, rays, hits, sun, radius, pixel)
-            dr.scatter(visible.sun, marched, pixel)
-    if occluders.casters is not None and objects is not None:
-        pixel = dr.compress(_mark_shaded_region(pose, rays, hits, visible.sun, occluders.footprint))
-        if len(pixel) > 0:
-            is_hidden, is_object = _shade_by_objects(occluders.casters, objects, pose, rays, hits, pixel)
-            dr.scatter(visible.sun, Float(0.0), pixel, is_hidden)
+        pixel_indices = dr.compress(is_uncertain)
+        if len(pixel_indices) > 0:
+            marched = _shade_by_rays(terrain, occluders.shadow, pose, rays, hits, sun, radius, pixel_indices)
+            dr.scatter(visible.sun, marched, pixel_indices)
+    if occluders.casters is not None and corner_normals is not None:
+        pixel_indices = dr.compress(_mark_shaded_region(pose, rays, hits, visible.sun, occluders.footprint))
+        if len(pixel_indices) > 0:
+            is_hidden, is_object = _shade_by_objects(occluders.casters, corner_normals, pose, rays, hits, pixel_indices)
+            dr.scatter(visible.sun, Float(0.0), pixel_indices, is_hidden)
             is_unknown = is_hidden & is_object if occluders.knows_outlines else is_hidden
-            aureole = AUREOLE_BEHIND_BODY * dr.gather(Float, visible.aureole, pixel, is_unknown)
-            dr.scatter(visible.aureole, aureole, pixel, is_unknown)
+            aureole = AUREOLE_BEHIND_BODY * dr.gather(Float, visible.aureole, pixel_indices, is_unknown)
+            dr.scatter(visible.aureole, aureole, pixel_indices, is_unknown)
     return visible

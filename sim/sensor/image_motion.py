@@ -20,7 +20,7 @@ from marsyard.sim.sensor.kernels.exposure import (
 )
 from marsyard.sim.sensor.optics import Image
 
-GRID_STEP_PX = 32.0  #: Spacing of the velocity grid's nodes, pixels.
+GRID_SPACING_PX = 32.0  #: Spacing of the velocity grid's nodes, pixels.
 SKY_DISTANCE_M = 1e9  #: Distance assumed for pixels without range (the sky), metres.
 STILL_PX = 0.01  #: Maximum motion of an image that is treated as still, pixels.
 #: Maximum motion during the transfer of a block of rows, pixels, and minimum and maximum number of rows in a block.
@@ -34,7 +34,7 @@ class ImageMotion:
     """Image velocity on a grid of pixels.
 
     `velocity_px_s` contains rows and columns per second at the nodes of a grid of at least 2 x 2. The first node is
-    pixel (0, 0), the spacing is `GRID_STEP_PX`; the velocity is constant beyond the last node.
+    pixel (0, 0), the spacing is `GRID_SPACING_PX`; the velocity is constant beyond the last node.
     """
 
     velocity_px_s: Float64[np.ndarray, "n m 2"]
@@ -78,8 +78,8 @@ class ImageMotion:
 
 
 def _grid_nodes(extent: int) -> Float64[np.ndarray, "nodes"]:
-    count = max(2, int(np.ceil((extent - 1) / GRID_STEP_PX)) + 1)
-    return GRID_STEP_PX * np.arange(count, dtype=np.float64)
+    count = max(2, int(np.ceil((extent - 1) / GRID_SPACING_PX)) + 1)
+    return GRID_SPACING_PX * np.arange(count, dtype=np.float64)
 
 
 def moving_exposure(
@@ -102,7 +102,7 @@ def moving_exposure(
     padded = np.pad(scene, pad, mode="edge")
     blur_scene = np.pad(scene, ((blur_pad, blur_pad), (blur_pad, blur_pad + 3)), mode="edge")
     charge = np.empty_like(scene)
-    blur(blur_scene, blur_pad, motion.velocity_px_s, GRID_STEP_PX, exposure_s, charge)
+    blur(blur_scene, blur_pad, motion.velocity_px_s, GRID_SPACING_PX, exposure_s, charge)
     charge *= np.float32(exposure_s)
     charge *= response
     arrays = (padded, response, charge)
@@ -119,7 +119,7 @@ def _add_clearing(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, 
     rows = len(response)
     # velocities at the nodes of the flipped image: time reversal changes the sign of both components, the flip changes
     # that of the row component again
-    positions = np.clip((rows - 1 - _grid_nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
+    positions = np.clip((rows - 1 - _grid_nodes(rows)) / GRID_SPACING_PX, 0.0, len(motion.velocity_px_s) - 1.0)
     node = np.minimum(positions.astype(np.int64), len(motion.velocity_px_s) - 2)
     fraction = (positions - node)[:, None, None]
     flipped = (1.0 - fraction) * motion.velocity_px_s[node] + fraction * motion.velocity_px_s[node + 1]
@@ -137,5 +137,5 @@ def _add_smear(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, row
     block_rows = int(np.clip(BLOCK_PX / max(motion.max_px_s * row_s, 1e-12), *BLOCK_ROWS))
     edges = np.append(np.arange(0, rows, block_rows), rows).astype(np.int64)
     pad = (len(padded) - rows) // 2
-    transfer = Transfer(padded, pad, response, edges, motion.velocity_px_s, GRID_STEP_PX, start_s, row_s)
+    transfer = Transfer(padded, pad, response, edges, motion.velocity_px_s, GRID_SPACING_PX, start_s, row_s)
     add_smear(transfer, gather_blocks(transfer, cumulative_row_sums(padded), average_blocks(response, edges)), charge)

@@ -18,7 +18,7 @@ from marsyard.sim.terrain.parameters import TerrainParameters
 #: Size of the coarsest cells of albedo texture of the ground and of rocks, m. Assumed: two samples of a descent's
 #: terrain at the default spacing, which resolves coarser variation; and a part of the face of a large rock.
 GROUND_TEXTURE_M, ROCK_TEXTURE_M = 3.0, 0.2
-#: Lower bound of the cells of texture, m: that of the micro-relief (`marsyard.sim.render.texture`).
+#: Lower bound of the cells of texture, m: that of the micro-relief (`marsyard.sim.render.micro_relief`).
 FINEST_TEXTURE_M = 0.001
 
 

@@ -27,10 +27,11 @@ MIN_TAP = 1e-6
 class Transfer(NamedTuple):
     """A moving scene during the charge transfer.
 
-    - padded, pad: scene with border, and width of the border in pixels
+    - padded, pad: scene with border of equal width on all sides, and width of the border in pixels; without the
+      additional columns of `blur`
     - response: relative response of each pixel
     - edges: first row of each block of rows, and the number of rows, shape (blocks + 1,)
-    - velocity, step: image velocity, as in `blur`
+    - velocity, spacing_px: image velocity, and spacing of its grid, as in `blur`
     - start_s, row_s: start time of the transfer relative to mid exposure, and time per row
     """
 
@@ -39,16 +40,16 @@ class Transfer(NamedTuple):
     response: Array32
     edges: NDArray[np.int64]
     velocity: Array
-    step: float
+    spacing_px: float
     start_s: float
     row_s: float
 
 
 @njit(cache=True)
-def interpolate_velocity(velocity: Array, step: float, row: float, column: float) -> tuple[float, float]:
+def interpolate_velocity(velocity: Array, spacing_px: float, row: float, column: float) -> tuple[float, float]:
     """Interpolate the velocity bilinearly at a pixel, rows and columns per second; constant beyond the grid."""
-    y = min(max(row / step, 0.0), velocity.shape[0] - 1.0)
-    x = min(max(column / step, 0.0), velocity.shape[1] - 1.0)
+    y = min(max(row / spacing_px, 0.0), velocity.shape[0] - 1.0)
+    x = min(max(column / spacing_px, 0.0), velocity.shape[1] - 1.0)
     i, j = min(int(y), velocity.shape[0] - 2), min(int(x), velocity.shape[1] - 2)
     fy, fx = y - i, x - j
     a, b, c, d = (1.0 - fy) * (1.0 - fx), (1.0 - fy) * fx, fy * (1.0 - fx), fy * fx
@@ -106,11 +107,12 @@ def _find_tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def blur(padded: Array32, pad: int, velocity: Array, step: float, exposure_s: float, out: Array32) -> None:
+def blur(padded: Array32, pad: int, velocity: Array, spacing_px: float, exposure_s: float, out: Array32) -> None:
     """Average the moving scene over the exposure.
 
-    - padded, pad: scene at mid exposure with border, and width of the border; three more columns on the right
-    - velocity, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
+    - padded, pad: scene at mid exposure with border, and width of the border; three more columns on the right, because
+      four taps of the kernel are read at a time
+    - velocity, spacing_px: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
     - out: output, shape of the scene without its border
     """
     rows, columns = out.shape
@@ -122,7 +124,9 @@ def blur(padded: Array32, pad: int, velocity: Array, step: float, exposure_s: fl
         bottom = min(top + TILE, rows)
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
-            v_row, v_column = interpolate_velocity(velocity, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
+            v_row, v_column = interpolate_velocity(
+                velocity, spacing_px, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1)
+            )
             write_path_kernel(v_row * exposure_s, v_column * exposure_s, pad, kernel)
             count = _find_tap_groups(kernel, groups)
             for r in range(top, bottom):
@@ -204,7 +208,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 
     Returns the sum at each edge, shape (blocks + 1, columns).
     """
-    pad, edges, velocity, step = transfer.pad, transfer.edges, transfer.velocity, transfer.step
+    pad, edges, velocity, spacing_px = transfer.pad, transfer.edges, transfer.velocity, transfer.spacing_px
     blocks, columns = response.shape
     line = np.empty(TILE, dtype=np.float32)
     sums = prefix.reshape(-1)
@@ -215,7 +219,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
             time = transfer.start_s + (edges[start] - centre) * transfer.row_s
             for left in range(0, columns, TILE):
                 width = min(TILE, columns - left)
-                v_row, v_column = interpolate_velocity(velocity, step, centre - 0.5, left + 0.5 * (width - 1))
+                v_row, v_column = interpolate_velocity(velocity, spacing_px, centre - 0.5, left + 0.5 * (width - 1))
                 y, x = pad - v_row * time, pad + left - v_column * time
                 line[:] = 0.0
                 _add_shifted(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
@@ -245,7 +249,9 @@ def add_smear(transfer: Transfer, edge_sums: Array32, charge: Array32) -> None:
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
             centre = 0.5 * (first + last - 1)
-            v_row, v_column = interpolate_velocity(transfer.velocity, transfer.step, centre, left + 0.5 * (width - 1))
+            v_row, v_column = interpolate_velocity(
+                transfer.velocity, transfer.spacing_px, centre, left + 0.5 * (width - 1)
+            )
             y, x = pad - v_row * time, pad + left - v_column * time
             shifted[:], in_block[:] = 0.0, 0.0
             for k in range(width):
@@ -257,6 +263,7 @@ def add_smear(transfer: Transfer, edge_sums: Array32, charge: Array32) -> None:
                 start = np.uint64(r * columns + left)
                 for k in range(width):
                     line[k] *= weights[start + np.uint64(k)]
+                    # the charge at the lower edge includes that of the block's own rows, which are added one by one
                     change[k] -= line[k]
             for r in range(first, last):
                 fraction = np.float32((r - first) / (last - first))

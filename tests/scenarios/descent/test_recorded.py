@@ -13,6 +13,7 @@ from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.descent.world import DescentWorld
+from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.sim.dynamics.pose_files import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.descents import make_parameters, run_descent
@@ -100,6 +101,27 @@ def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
     state = parameters.flight.motion(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)
+
+
+@pytest.mark.parametrize(
+    ("attitude_of", "axes_in_vehicle"),
+    [
+        # x, y, z of the body (the camera looks along -z, columns along x) and of OpenCV's camera (right, down, forward)
+        ("body", ([0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0])),
+        ("camera", ([0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0])),
+    ],
+)
+def test_mounting_is_that_of_the_body_or_of_the_camera(
+    attitude_of: str, axes_in_vehicle: tuple[list[float], ...]
+) -> None:
+    """The vehicle's axes are forward, left, up; its camera looks forward."""
+    mounting = tuple(Rotation.from_matrix(np.transpose(axes_in_vehicle)).as_quat().tolist())
+    axes = RecordedAxes.model_validate({"axes": "enu", "attitude_of": attitude_of, "mounting": mounting})
+    world_from_vehicle = Rotation.from_euler("zyx", [30.0, 20.0, 10.0], degrees=True)
+    attitude = axes.body_attitudes(world_from_vehicle)
+    forward, right = [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
+    assert np.allclose(attitude.apply([0.0, 0.0, -1.0]), world_from_vehicle.apply(forward))
+    assert np.allclose(attitude.apply([1.0, 0.0, 0.0]), world_from_vehicle.apply(right))
 
 
 @pytest.mark.parametrize("first_image_s", [None, 1750000005.0])

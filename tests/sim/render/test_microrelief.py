@@ -12,11 +12,8 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f64, Float, Float64, UInt32
-from marsyard.sim.render.noise import noise_in_plane
-from marsyard.sim.render.texture import (
+from marsyard.sim.render.micro_relief import (
     HEIGHT_VARIANCE,
-    MIN_SLOPE_CELLS,
-    SLOPE_FADING,
     SLOPE_VARIANCE,
     MicroRelief,
     RoughGround,
@@ -24,6 +21,8 @@ from marsyard.sim.render.texture import (
     relief_slopes,
     smith_shadowing,
 )
+from marsyard.sim.render.noise import noise_in_plane
+from marsyard.sim.render.texture import MIN_SLOPE_CELLS, SLOPE_FADING
 from marsyard.sim.terrain import Surface
 from tests.sim.scenes import LAMBERT, descent_camera
 
