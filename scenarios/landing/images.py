@@ -69,8 +69,13 @@ def take_images(
     # another name of a random stream would change the random values
     detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
-    # the fault `repeated_image` = 1 replaces image 2
-    delivered_images = corrupt_images(counts, 2 * p.faults.repeated_image, p.faults.black_image, p.faults.lost_rows)
+    delivered_images = corrupt_images(
+        counts,
+        repeated=2 if p.faults.repeated_image else 0,
+        black=p.faults.black_image,
+        incomplete=2,
+        lost_rows=p.faults.lost_rows,
+    )
     camera = p.detector.delivered_camera(optics.camera)
     first, second = (
         DetectorImage(image, state.time_s, camera, detector.calibration)
