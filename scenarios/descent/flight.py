@@ -45,7 +45,7 @@ class DescentFlight:
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
     """Return the gravity of the site, or of Mars for a generic terrain."""
-    return (Environment() if p.preset is None else p.preset.environment).gravity_m_s2
+    return (Environment() if p.site_preset is None else p.site_preset.environment).gravity_m_s2
 
 
 def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:

@@ -58,7 +58,7 @@ class LandingFlight:
         # azimuths are clockwise from north, angles counterclockwise from east; `heading` is that of the image's right
         heading = -np.radians(p.image_poses.heading_deg)
         course = np.pi / 2 - np.radians(p.image_poses.heading_deg + p.image_poses.course_deg)
-        gravity = p.preset.environment.gravity_m_s2
+        gravity = p.site_preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
