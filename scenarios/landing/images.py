@@ -12,6 +12,7 @@ from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.scenarios.meshes import add_meshes
 from marsyard.scenarios.views import Viewpoint, render_state, site_scene
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.render import Frame
 from marsyard.sim.sensor import Detector, auto_expose
@@ -29,6 +30,11 @@ class Pair:
     def counts(self) -> tuple[UInt16[np.ndarray, "rows columns"], UInt16[np.ndarray, "rows columns"]]:
         """Detector counts of both images."""
         return self.images[0].counts, self.images[1].counts
+
+    @property
+    def cameras(self) -> tuple[CameraModel, CameraModel]:
+        """True cameras of both images, body frame."""
+        return self.images[0].camera, self.images[1].camera
 
     @property
     def axis_range_m(self) -> float:
