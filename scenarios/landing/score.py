@@ -53,8 +53,9 @@ def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, 
     elif details.tracks is not None:
         tracks = details.tracks
         column, row_index = np.rint(tracks.first).astype(np.int64).T
-        # a delivered row is the sum of rendered rows, the first of which represents it here
-        rendered_row = row_index * pair.images[0].calibration.rows_summed
+        # a delivered row is the sum of rendered rows, the middle of which represents it (as in `select_middle_rows`)
+        rows_summed = pair.images[0].calibration.rows_summed
+        rendered_row = row_index * rows_summed + rows_summed // 2
         points = pair.frames[0].points_world((rendered_row, column))
         camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
         pixels, in_front = camera.project(points)
