@@ -61,19 +61,27 @@ def add_detector_faults(faults: SizedFaults, detector: DetectorParameters) -> De
     return detector.model_copy(update=changes)
 
 
-def corrupt_images(images: Images, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
+def corrupt_images(
+    images: Images, *, repeated: int, black: int, incomplete: int = 0, lost_rows: float = 0.0
+) -> list[np.ndarray]:
     """Return images with transmission faults.
 
     - repeated: number, from 2, of the image that is replaced by the previous image; 0: none
     - black: number, from 1, of the image that is replaced by a black image; 0: none
-    - lost_rows: fraction of the rows of image 2 that is lost, from the bottom
+    - incomplete: number, from 1, of the image that loses rows; 0: none
+    - lost_rows: fraction of the rows of the incomplete image that is lost, from the bottom
+
+    Raises ValueError for another number.
     """
+    for name, number, first in (("repeated", repeated, 2), ("black", black, 1), ("incomplete", incomplete, 1)):
+        if number and not first <= number <= len(images):
+            raise ValueError(f"{name} is image {number}; allowed: {first} to {len(images)}, or 0 for none")
     copies = [image.copy() for image in images]
     if repeated:
         copies[repeated - 1] = copies[repeated - 2].copy()
     if black:
         copies[black - 1][:] = 0
-    n_lost_rows = round(lost_rows * len(copies[1])) if lost_rows else 0
-    if n_lost_rows:
-        copies[1][-n_lost_rows:] = 0
+    if incomplete:
+        image = copies[incomplete - 1]
+        image[len(image) - round(lost_rows * len(image)) :] = 0
     return copies

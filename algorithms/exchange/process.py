@@ -114,13 +114,19 @@ class RunningProgram:
             message = f"{words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
         #: time that is left for the answers to the present case, s
-        self.left_s = limits.total_s
-        self._clock, self._time_s = AwakeClock(), min(limits.time_s, self.left_s)
+        self._left_s = limits.total_s
+        #: whether the present line is an answer to a case, not a line of the start-up
+        self._is_answer = True
+        self._clock, self._time_s = AwakeClock(), min(limits.time_s, self._left_s)
         self._checked_s = self._files_checked_s = 0.0
 
     @property
     def max_greeting_s(self) -> float:
-        """Limit of the time until the greeting line of a program with requests: that of an answer."""
+        """Limit of the time until the greeting line of a program with requests.
+
+        An external program has the time of one answer. `marsyard.scenarios.isolation.remote.PythonProgram` has another
+        limit.
+        """
         return self.limits.time_s
 
     @property
@@ -132,6 +138,10 @@ class RunningProgram:
         """Whether the program has not ended."""
         return self._process.poll() is None
 
+    def begin_case(self) -> None:
+        """Reset the time for all answers to one case; a new program is at the beginning of a case."""
+        self._left_s = self.limits.total_s
+
     def read_all(self) -> Output:
         """Read the output of the program until it exits with status 0."""
         start_s = time.perf_counter()
@@ -142,15 +152,20 @@ class RunningProgram:
         self._kill()
         return output
 
-    def read_line(self, request: str | None = None, time_s: float | None = None) -> Output:
-        """Send an optional request line and read one output line, within `time_s` instead of the limit if it is given.
+    def read_line(self, request: str | None = None, start_up_s: float | None = None) -> Output:
+        """Send an optional request line and read one output line.
+
+        - start_up_s: limit of the time for a line of the start-up, which is not part of the time for a case; None: the
+          line is an answer to the present case, and has the limits of the answers
 
         Output before the request is a fault (BAD_ANSWER): it could be a second line for the previous case.
         """
         start_s = time.perf_counter()
         self._stdout.clear()
         self._stderr.clear()
-        self._clock, self._time_s = AwakeClock(), min(time_s or self.limits.time_s, self.left_s)
+        self._is_answer = start_up_s is None
+        self._clock = AwakeClock()
+        self._time_s = min(self.limits.time_s, self._left_s) if start_up_s is None else start_up_s
         if request is not None and (early_output := _read_pending(self._process.stdout)):
             message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
             raise self._end_with_fault(Fault.BAD_ANSWER, message)
@@ -165,7 +180,8 @@ class RunningProgram:
         first_line, _, extra_output = bytes(self._stdout).partition(b"\n")
         if extra_output:
             raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than one line")
-        self.left_s -= self._clock.elapsed_s()
+        if self._is_answer:
+            self._left_s -= self._clock.elapsed_s()
         return self._collect_output(first_line, start_s)
 
     def stop(self) -> None:
@@ -211,9 +227,8 @@ class RunningProgram:
         """Kill the program and raise AlgorithmError if it exceeds a limit."""
         elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
         if elapsed_s > self._time_s:
-            is_total = self._time_s == self.left_s
             message = f"no answer within {self._time_s:g} s"
-            if is_total:
+            if self._is_answer and self._time_s == self._left_s:
                 message = f"no answers to the case within {self.limits.total_s:g} s"
             raise self._end_with_fault(Fault.TIMED_OUT, message)
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:

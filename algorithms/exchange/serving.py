@@ -101,17 +101,20 @@ class Server:
     child: RunningProgram
     request_count: int = 0
 
-    def send_request(self, request: Mapping[str, Any], time_s: float | None = None) -> tuple[Mapping[str, Any], Output]:
+    def send_request(
+        self, request: Mapping[str, Any], start_up_s: float | None = None
+    ) -> tuple[Mapping[str, Any], Output]:
         """Send one request; return the program's answer without its `id`, and its raw output.
 
-        `time_s` is the limit of the time for the answer; None: the limit of the program.
+        `start_up_s` is the limit of the time for a request of the start-up; None: the request belongs to the present
+        case, see `RunningProgram.read_line`.
         If the program fails, its answer is not one JSON object, or the answer belongs to another request, the program
         is ended and AlgorithmError raised.
         """
         self.request_count += 1
         header = {"exchange": EXCHANGE_VERSION, "id": self.request_count}
         line = json.dumps({**header, **request}, allow_nan=False)
-        output = self.child.read_line(line, time_s)
+        output = self.child.read_line(line, start_up_s)
         try:
             answer = parse_object(output)
             for key, expected in header.items():
@@ -136,12 +139,12 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
     idle = _idle.pop((command, limits), None)
     if idle is not None:
         if idle.child.is_running():
-            idle.child.left_s = limits.total_s
+            idle.child.begin_case()
             return idle
         # also removes its folder and its child processes
         idle.child.stop()
     child = command.start(limits)
-    output = child.read_line(time_s=child.max_greeting_s)
+    output = child.read_line(start_up_s=child.max_greeting_s)
     try:
         expected = {"exchange": EXCHANGE_VERSION, "ready": True}
         if parse_object(output) != expected:

@@ -136,7 +136,7 @@ def refine_match(
     (`warp` is ``none``), or if the shift cannot be registered, `corner + offset` is returned; if a warp cannot be
     registered, the result of the previous model.
     """
-    peak_fit = Refinement(corner + offset, integer_peak.value, integer_peak.value)
+    peak_fit = Refinement(corner=corner + offset, score=integer_peak.value, warped_score=integer_peak.value)
     if options.warp == "none":
         return peak_fit
     start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
@@ -168,7 +168,7 @@ def match_by_correlation(
     peak = coarse_to_fine_peak(template, window, options.coarse_levels, options.coarse_candidates)
     half = 0.5 * (options.template_px - 1)
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
-    best = Refinement(corner, peak.value, peak.value)
+    best = Refinement(corner=corner, score=peak.value, warped_score=peak.value)
     if options.subpixel:
         offset = np.zeros(2)
         if not peak.on_border:

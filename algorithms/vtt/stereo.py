@@ -96,10 +96,11 @@ def point_stereo(
     if not np.any(is_near_curve):
         return None
     peak = highest_peak(np.where(is_near_curve, surface, -1.0))
-    corner = start[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
-    best = Refinement(corner, peak.value, peak.value)
+    # pixels and corners of images are (u, v), positions in arrays (row, column)
+    corner_row_column = start[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
+    best = Refinement(corner=corner_row_column, score=peak.value, warped_score=peak.value)
     if options.subpixel:
-        best = refine_match(template, image, corner, biquadratic_offset(surface, peak), peak, options)
+        best = refine_match(template, image, corner_row_column, biquadratic_offset(surface, peak), peak, options)
     return StereoMatch(pixel=best.corner[::-1] + half + image.corner, score=best.warped_score)
 
 

@@ -129,7 +129,7 @@ class MonitoredWorker:
         self._executor: Any = ProcessPoolExecutor(
             max_workers=1,
             initializer=worker_process.start_worker,
-            initargs=(os.getpid(), str(self._folder)),
+            initargs=(os.getpid(), str(self._folder), str(self._parent_folder.parent)),
             env={
                 **_WORKER_ENVIRONMENT,
                 _MARK: str(self._folder),

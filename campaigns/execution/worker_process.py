@@ -97,8 +97,12 @@ class _WorkerContext:
 _context: _WorkerContext | None = None
 
 
-def start_worker(parent: int, folder: str) -> None:
+def start_worker(parent: int, folder: str, all_workers_folder: str) -> None:
     """Set up a fresh worker process.
+
+    - parent: process id of the parent
+    - folder: folder of the files of this process
+    - all_workers_folder: folder of all workers of the parent, see `become_supervised`
 
     The worker leads a process group below a supervisor (`marsyard.campaigns.execution.supervisor`), which ends with the
     parent and kills the worker's descendants. The worker writes its output, and its stack trace on a fatal signal, to
@@ -112,8 +116,9 @@ def start_worker(parent: int, folder: str) -> None:
     output = os.open(Path(folder, "output"), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
     for stream in (1, 2):
         os.dup2(output, stream)
-    become_supervised(parent, Path(folder).parent.parent)
+    become_supervised(parent, Path(all_workers_folder))
     if sys.platform == "linux":
+        # this process is the fork of the supervisor, which called `setpgid` above: each leads a group of its own
         os.setpgid(0, 0)
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
     trace = Path(folder, "trace")
@@ -130,7 +135,7 @@ def start_worker(parent: int, folder: str) -> None:
 def load_task(_task: Callable[[int], object], load: Callable[[], object] | None, item: int) -> None:
     """Load the code of a task in this worker; a death of the process is attributed to `item`, the first item.
 
-    Python imports the modules of the task when it unpickles the arguments.
+    `_task` is not called here. It is an argument because Python imports its modules when it unpickles the arguments.
     """
     if load is None:
         return

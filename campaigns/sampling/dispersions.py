@@ -15,6 +15,7 @@ from marsyard.campaigns.errors import suggest_similar
 from marsyard.campaigns.sampling import dispersion_base as base
 from marsyard.campaigns.sampling.distributions import (
     STANDARD_NORMAL,
+    TruncationError,
     UnivariateDistribution,
     create_scipy_distribution,
     scipy_distributions,
@@ -197,10 +198,9 @@ class Normal(base.Dispersion):
             return self
         try:
             self.quantile(0.5)
-        except ValueError as error:
-            # the limits in its message are those of the standard normal distribution
-            reason = str(error).partition(": ")[2]
-            raise ValueError(f"truncate = [{self.truncate[0]}, {self.truncate[1]}]: {reason}") from error
+        except TruncationError as error:
+            # its limits are those of the standard normal distribution
+            raise TruncationError(*self.truncate, error.reason) from error
         return self
 
     @cached_property
@@ -263,8 +263,8 @@ class CyclicInteger(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
     No number repeats before all numbers have occurred; for example, a campaign then uses as many terrains as possible.
-    If the number only selects one of many independent terrains, cases with different numbers are independent. In a
-    study the number follows the number of the random streams.
+    If the number only selects one of many independent terrains, cases with different numbers are independent. Several
+    cases of a study can have the same random streams: they have the same number, that of these streams in the sequence.
     """
 
     distribution: Literal["in-turn"]
@@ -275,7 +275,7 @@ class CyclicInteger(_WholeNumbers):
         return int(self.high) - int(self.low) + 1
 
     def value(self, case: int) -> int:
-        """Return the number of a case."""
+        """Return the number of a case; in a study, `case` is the number of the case's random streams."""
         return int(self.low) + case % self.size
 
 

@@ -11,6 +11,21 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 
+class TruncationError(ValueError):
+    """A distribution cannot be truncated to the limits `low` and `high`; `reason` states why, without the limits.
+
+    A limit can be a formula of a campaign file.
+    """
+
+    def __init__(self, low: float | str, high: float | str, reason: str) -> None:
+        # all arguments, so that the error can be pickled
+        super().__init__(low, high, reason)
+        self.low, self.high, self.reason = low, high, reason
+
+    def __str__(self) -> str:
+        return f"truncate = [{self.low}, {self.high}]: {self.reason}"
+
+
 @dataclass(frozen=True, eq=False)
 class UnivariateDistribution:
     """A distribution of one variable.
@@ -95,7 +110,8 @@ def truncated_quantile(
     The quantile at p is F^-1(F(a) + p (F(b) - F(a))). If a exceeds the median, the survival function replaces F, since
     1 - F would lose digits of small values. The limits of discrete distributions are included.
 
-    Raises ValueError if the limits are in the wrong order or the probability between them is zero.
+    Raises TruncationError if the limits are in the wrong order or the probability between them is zero, and ValueError
+    if a discrete distribution includes infinity or the distribution is not defined for its parameters.
     """
     low, high = distribution.support if limits is None else limits
     if limits is None:
@@ -113,11 +129,11 @@ def truncated_quantile(
 def _find_truncated_inverse(distribution: UnivariateDistribution, low: float, high: float) -> tuple[str, float, float]:
     """Return the name of the inverse function with the higher precision, and its arguments at the two limits."""
     if not (low <= high if distribution.is_discrete else low < high):
-        raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
+        raise TruncationError(low, high, "the first limit must be below the second")
     # the lower limit of a discrete distribution is included: F is evaluated at the previous integer
     low_argument = math.ceil(low) - 1.0 if distribution.is_discrete else low
     function, inverse = ("sf", "isf") if distribution.evaluate("cdf", low_argument) > 0.5 else ("cdf", "ppf")
     at_low, at_high = distribution.evaluate(function, low_argument), distribution.evaluate(function, high)
     if not abs(at_high - at_low) > 0.0:
-        raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
+        raise TruncationError(low, high, "the distribution has no probability between the limits")
     return inverse, at_low, at_high

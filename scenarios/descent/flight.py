@@ -45,7 +45,7 @@ class DescentFlight:
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
     """Return the gravity of the site, or of Mars for a generic terrain."""
-    return (Environment() if p.preset is None else p.preset.environment).gravity_m_s2
+    return (Environment() if p.site_preset is None else p.site_preset.environment).gravity_m_s2
 
 
 def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:
@@ -80,7 +80,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         motion, row = p.flight.compute(inputs, site_m, streams.generator("own motion"))
         check_looks_down(p.flight.motion, motion, times)
     else:
-        motion = p.flight.motion(site_m, gravity_m_s2(p))
+        motion = p.flight.create_trajectory(site_m, gravity_m_s2(p))
     positions = motion.motion(np.array(times)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     invalid_indices = np.flatnonzero(heights <= 0.0)

@@ -236,7 +236,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         return last - 2 * spacing, last - spacing, last
 
     @property
-    def preset(self) -> Site | None:
+    def site_preset(self) -> Site | None:
         """The site; None for a generic terrain."""
         return (
             None if self.site is None else site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)

@@ -52,38 +52,39 @@ class FlightFile(UserFile, RecordedAxes):
         return read_poses(file).sha256
 
     @property
-    def start_s(self) -> float:
+    def first_image_time_s(self) -> float:
         """File's time of the first image."""
-        return self.first_image_s if self.first_image_s is not None else float(self._start)
+        return self.first_image_s if self.first_image_s is not None else float(self._exact_first_image_time_s)
 
     @property
-    def _start(self) -> Decimal:
-        """File's time of the first image, exact: a large time in floating point would be rounded."""
+    def _exact_first_image_time_s(self) -> Decimal:
+        """File's time of the first image; a large time in floating point would be rounded."""
         if self.first_image_s is not None:
             return Decimal(repr(self.first_image_s))
         return read_poses(self.file).start_s + Decimal(repr(self.lead_s))
 
     def check(self, image_times_s: Sequence[float]) -> None:
         """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
-        motion = self.motion(np.zeros(3), 0.0)
-        first, last = motion.span_s
+        trajectory = self.create_trajectory(np.zeros(3), 0.0)
+        first, last = trajectory.span_s
         if first > -self.lead_s + _ROUNDING_S or last < max(image_times_s) + END_MARGIN_S:
             poses = read_poses(self.file)
+            last_image_time_s = self.first_image_time_s + max(image_times_s)
             begin, end = (poses.start_s + Decimal(time) for time in poses.times_s[[0, -1]].tolist())
             raise TrajectoryFileError(
-                f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from {self.start_s:.3f} to "
-                f"{self.start_s + max(image_times_s):.3f} s, lead_s {self.lead_s:g} s before and {END_MARGIN_S:g} s "
-                "after them are needed"
+                f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from "
+                f"{self.first_image_time_s:.3f} to {last_image_time_s:.3f} s, lead_s {self.lead_s:g} s before and "
+                f"{END_MARGIN_S:g} s after them are needed"
             )
-        check_looks_down(self.file, motion, image_times_s)
-        for number, position in enumerate(motion.motion(np.array(image_times_s)).positions_m, start=1):
+        check_looks_down(self.file, trajectory, image_times_s)
+        for number, position in enumerate(trajectory.motion(np.array(image_times_s)).positions_m, start=1):
             if self.origin is FlightOrigin.LOCATION and position[2] <= 0.0:
                 raise TrajectoryFileError(
                     f"{self.file}: at image {number} the camera is {-position[2]:.1f} m below the ground at the "
                     'location; allowed: above it (with origin = "terrain", heights refer to the terrain\'s origin)'
                 )
 
-    def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
+    def create_trajectory(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
         """Transform the flight to world axes with time 0 at the first image; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
         world_from_file = (
@@ -93,13 +94,13 @@ class FlightFile(UserFile, RecordedAxes):
         positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)
         if self.origin is FlightOrigin.LOCATION:
             positions = positions + ground_m
-        times = poses.times_s - float(self._start - poses.start_s)
+        times = poses.times_s - float(self._exact_first_image_time_s - poses.start_s)
         return RecordedMotion(times, positions, self.body_attitudes(attitudes), gravity_m_s2)
 
 
-def check_looks_down(name: str, motion: RecordedMotion, image_times_s: Sequence[float]) -> None:
+def check_looks_down(name: str, trajectory: RecordedMotion, image_times_s: Sequence[float]) -> None:
     """Raise TrajectoryFileError if the camera of the flight looks up at an image; `name` is used in the message."""
-    for number, attitude in enumerate(motion.motion(np.array(image_times_s)).attitudes, start=1):
+    for number, attitude in enumerate(trajectory.motion(np.array(image_times_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))

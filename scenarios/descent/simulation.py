@@ -52,7 +52,7 @@ class Descent:
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
         exposures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
-        images = corrupt_images(exposures, p.faults.repeated_image, p.faults.black_image)
+        images = corrupt_images(exposures, repeated=p.faults.repeated_image, black=p.faults.black_image)
         instruments = DescentInstruments.draw(p, world, flight, streams)
         if p.exact_instruments:
             measurements = measure_exactly(p, world, states, images, detector)

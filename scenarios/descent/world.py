@@ -46,11 +46,11 @@ class DescentWorld:
         bank = TerrainBank(terrain, p.location.bank_seed)
         surface = bank.terrain(p.location.terrain)
         azimuth, elevation = np.radians([p.sun.azimuth_deg, p.sun.elevation_deg]).tolist()
-        if p.preset is None:
+        if p.site_preset is None:
             return cls(surface, None, Sun(direction(azimuth, elevation)), p.meshes)
-        air = p.preset.environment
+        air = p.site_preset.environment
         sun = sun_at(air, p.sun.azimuth_deg, p.sun.elevation_deg)
-        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain, surface))
+        ground = SiteGround(p.site_preset, terrain, surface, bank.rocks(p.location.terrain, surface))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(self, east_m: float, north_m: float, last_height_m: float, pixel_rad: float) -> Scene:

@@ -4,7 +4,6 @@ The process is started once per worker, constructs the algorithm once, and recei
 after an exception, an exceeded limit or an unreadable answer; the next case starts a new one.
 """
 
-import math
 import os
 import sys
 import time
@@ -86,9 +85,7 @@ class RemoteAlgorithm:
         self._sender = Sender(child.memory_fd)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
-        child.left_s = math.inf  # construction has a limit of its own
-        answer = self._request("start", start, limits.loading_s)
-        child.left_s = limits.total_s
+        answer = self._request("start", start, start_up_s=limits.loading_s)
         members = answer.get("members")
         self._members = members if isinstance(members, dict) else {}
 
@@ -121,9 +118,9 @@ class RemoteAlgorithm:
         except OSError:  # the process has ended, which the next request reports; its time is lost
             return 0.0
 
-    def _request(self, action: str, values: Mapping[str, Any], time_s: float | None = None) -> Mapping[str, Any]:
+    def _request(self, action: str, values: Mapping[str, Any], start_up_s: float | None = None) -> Mapping[str, Any]:
         try:
-            answer, output = self._server.send_request({"do": action, **values}, time_s)
+            answer, output = self._server.send_request({"do": action, **values}, start_up_s)
             if "fault" in answer:
                 self._server.child.stop()
                 raise _read_fault(answer, output.stderr)
@@ -194,7 +191,7 @@ def describe_in_process(spec: str) -> AlgorithmDescription:
     try:
         server = acquire_server(command, limits)
         request = {"do": "describe", "path": search_path(), "spec": spec}
-        answer, _ = server.send_request(request, limits.loading_s)
+        answer, _ = server.send_request(request, start_up_s=limits.loading_s)
     except AlgorithmError as error:
         raise ImportError(f"{error.fault.name}: {error}") from error
     server.child.stop()

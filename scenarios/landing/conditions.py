@@ -1,4 +1,7 @@
-"""Columns of a landing case that do not depend on an algorithm: conditions and measurement errors."""
+"""Columns of a landing case that do not depend on an algorithm: conditions and measurement errors.
+
+Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 import numpy as np
 
@@ -6,14 +9,16 @@ from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
-from marsyard.scenarios.landing.score import true_motion
 from marsyard.scenarios.landing.simulation import RenderedFlight
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
 
-#: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
-#: axis, and change of height as a fraction of the range along the optical axis.
-MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
+#: Maximum rotations between the images for tracking (section II.A): about the optical axis, and about each other axis.
+MAX_ROLL_DEG, MAX_TILT_DEG = 10.0, 20.0
+#: Maximum change of height between the images for tracking, divided by the range along the first optical axis. Section
+#: II.A limits the change of altitude to 20 % and does not name the divisor; the range determines the images' scale. The
+#: column `height_change_fraction` is divided by the height above the ground.
+MAX_HEIGHT_CHANGE_PER_RANGE = 0.2
 #: Tolerances of these limits: flights that are exactly at a limit are within it.
 _ANGLE_TOLERANCE_DEG, _FRACTION_TOLERANCE = 0.5, 0.01
 
@@ -40,20 +45,23 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
-    # for the limits of tracking: components of the rotation vector about the x, y and optical axes of the camera
-    pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
-    # height and vertical at the first image; motion and rotation vector, body axes, to the second image
+    # for the limits of tracking: magnitudes of the rotations about the x, y and optical axes of the camera
+    camera_rotation = case.flight.true_motion(pair.cameras).rotation
+    camera_pitch_deg, camera_yaw_deg, camera_roll_deg = np.degrees(np.abs(camera_rotation.as_rotvec()))
+    # height and vertical at the first image; motion and rotation to the second image
     first, second = case.flight.states
     motion = second.position_m - first.position_m
     east, north, climb = motion
     positions = np.stack([first.position_m, second.position_m])
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
     up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-    rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
+    # for the columns: rotation vector in the body axes at the first image
+    body_rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
+    body_pitch_deg, body_yaw_deg, body_roll_deg = body_rotation_deg
     within_limits = (
-        roll < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
-        and max(pitch, yaw) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
-        and abs(float(climb)) < (MAX_HEIGHT_CHANGE_FRACTION + _FRACTION_TOLERANCE) * pair.axis_range_m
+        camera_roll_deg < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
+        and max(camera_pitch_deg, camera_yaw_deg) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
+        and abs(float(climb)) < (MAX_HEIGHT_CHANGE_PER_RANGE + _FRACTION_TOLERANCE) * pair.axis_range_m
     )
     return {
         "site": p.site,
@@ -64,8 +72,10 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "baseline_m": float(np.linalg.norm(motion)),
         "height_change_fraction": float(climb / height),
         "baseline_fraction": float(np.hypot(east, north) / height),
-        "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
-        **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
+        "pair_rotation_deg": float(np.linalg.norm(body_rotation_deg)),
+        "pitch_deg": float(body_pitch_deg),
+        "yaw_deg": float(body_yaw_deg),
+        "roll_deg": float(body_roll_deg),
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),
         "exposure_s": pair.images[0].calibration.exposure_s,
         "image_median_dn": float(np.median(pair.counts[0])),

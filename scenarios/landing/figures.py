@@ -9,7 +9,7 @@ from marsyard.algorithms.hda import HdaDetails, MappedGround, Safety, hda_produc
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.helicopter import NavigatedLeg
-from marsyard.scenarios.landing.score import true_motion, true_site
+from marsyard.scenarios.landing.score import true_site
 from marsyard.scenarios.landing.simulation import RenderedFlight
 from marsyard.scenarios.landing.touchdown import Touchdown
 from marsyard.scenarios.meshes import add_meshes
@@ -54,7 +54,7 @@ def case_products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any
     arrays: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
     if isinstance(estimate.details, HdaDetails):
         arrays |= hda_products(estimate.details)
-    second_from_first = true_motion(flight, pair)
+    second_from_first = flight.true_motion(pair.cameras)
     arrays |= {
         "true_rotation": second_from_first.rotation.as_matrix(),
         "true_translation": np.array(second_from_first.translation),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.cameras import draw_calibrated
 from marsyard.scenarios.landing.faults import add_range_faults, add_receiver_outage, draw_received_images
@@ -14,6 +14,7 @@ from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, T
 from marsyard.scenarios.landing.pair_choice import choose_pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.views import nadir_pose
+from marsyard.sim.camera import CameraModel, camera_pose
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
@@ -58,7 +59,7 @@ class LandingFlight:
         # azimuths are clockwise from north, angles counterclockwise from east; `heading` is that of the image's right
         heading = -np.radians(p.image_poses.heading_deg)
         course = np.pi / 2 - np.radians(p.image_poses.heading_deg + p.image_poses.course_deg)
-        gravity = p.preset.environment.gravity_m_s2
+        gravity = p.site_preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
@@ -83,6 +84,13 @@ class LandingFlight:
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
         """Estimated minus true position at the first image."""
         return np.asarray(np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m)
+
+    def true_motion(self, cameras: tuple[CameraModel, CameraModel]) -> RigidTransform:
+        """Compute the true motion from the first to the second camera's frame; `cameras` are in the body frame."""
+        first, second = (
+            state.world_from_body * camera_pose(camera) for state, camera in zip(self.states, cameras, strict=True)
+        )
+        return second.inv() * first
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:

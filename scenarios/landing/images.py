@@ -12,6 +12,7 @@ from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.scenarios.meshes import add_meshes
 from marsyard.scenarios.views import Viewpoint, render_state, site_scene
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.render import Frame
 from marsyard.sim.sensor import Detector, auto_expose
@@ -29,6 +30,11 @@ class Pair:
     def counts(self) -> tuple[UInt16[np.ndarray, "rows columns"], UInt16[np.ndarray, "rows columns"]]:
         """Detector counts of both images."""
         return self.images[0].counts, self.images[1].counts
+
+    @property
+    def cameras(self) -> tuple[CameraModel, CameraModel]:
+        """True cameras of both images, body frame."""
+        return self.images[0].camera, self.images[1].camera
 
     @property
     def axis_range_m(self) -> float:
@@ -69,8 +75,13 @@ def take_images(
     # another name of a random stream would change the random values
     detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
-    # the fault `repeated_image` = 1 replaces image 2
-    delivered_images = corrupt_images(counts, 2 * p.faults.repeated_image, p.faults.black_image, p.faults.lost_rows)
+    delivered_images = corrupt_images(
+        counts,
+        repeated=2 if p.faults.repeated_image else 0,
+        black=p.faults.black_image,
+        incomplete=2,
+        lost_rows=p.faults.lost_rows,
+    )
     camera = p.detector.delivered_camera(optics.camera)
     first, second = (
         DetectorImage(image, state.time_s, camera, detector.calibration)

@@ -187,7 +187,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @model_validator(mode="after")
     def _check_consistency(self) -> LandingScenarioParameters:
         """Check terrain and light (they must come from the same site), row binning, and faults."""
-        if getattr(self.preset, self.scale) is None:
+        if getattr(self.site_preset, self.scale) is None:
             raise ValueError(f"site {self.site} has no terrain at the scale '{self.scale}'")
         rows = self.optics.size[1]
         if rows % self.detector.rows_summed:
@@ -210,6 +210,6 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         return self.image_poses.height_m if self.helicopter is None else self.helicopter.transit.height_m
 
     @property
-    def preset(self) -> Site:
-        """The site with the dust of the case."""
+    def site_preset(self) -> Site:
+        """The site with the dust and the photometry of the case."""
         return site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)

@@ -1,9 +1,11 @@
-"""Result columns of a landing case: tracks and motion, reported site and touchdown, compared with the truth."""
+"""Result columns of a landing case: tracks and motion, reported site and touchdown, compared with the truth.
+
+Table I and section III are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda import STAGES, HdaDetails
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
@@ -13,7 +15,6 @@ from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m
-from marsyard.sim.camera import camera_pose
 
 #: Maximum distance of a correct track from the true pixel, px.
 MAX_TRACK_ERROR_PX = 1.0
@@ -41,15 +42,6 @@ TOUCHDOWN_COLUMNS = (
 )  # fmt: skip
 
 
-def true_motion(flight: LandingFlight, pair: Pair) -> RigidTransform:
-    """Compute the true motion from the first to the second camera's frame."""
-    first, second = (
-        state.world_from_body * camera_pose(image.camera)
-        for state, image in zip(flight.states, pair.images, strict=True)
-    )
-    return second.inv() * first
-
-
 def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, Scalar]:
     """Compute the columns of tracks and motion errors; NaN for stages that were not reached."""
     row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, np.nan)
@@ -61,7 +53,10 @@ def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, 
     elif details.tracks is not None:
         tracks = details.tracks
         column, row_index = np.rint(tracks.first).astype(np.int64).T
-        points = pair.frames[0].points_world((row_index * pair.images[0].calibration.rows_summed, column))
+        # a delivered row is the sum of rendered rows, the middle of which represents it (as in `select_middle_rows`)
+        rows_summed = pair.images[0].calibration.rows_summed
+        rendered_row = row_index * rows_summed + rows_summed // 2
+        points = pair.frames[0].points_world((rendered_row, column))
         camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
         pixels, in_front = camera.project(points)
         with np.errstate(invalid="ignore"):
@@ -79,7 +74,7 @@ def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, 
             "tracks_outlier_fraction": float(np.mean(~is_correct[tracks.accepted])) if accepted else np.nan,
         }
     if details.motion is not None:
-        row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
+        row |= motion_errors(details.motion.second_from_first, flight.true_motion(pair.cameras))
     return row | stage_row(details)
 
 

@@ -26,7 +26,7 @@ class LandingWorld(SiteWorld):
         """Create the world of a case."""
         # the site without the dust of the case, so that cases share the cached terrain
         ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
-        dusty_site = p.preset
+        dusty_site = p.site_preset
         texture, air = dusty_site.ground_texture, dusty_site.environment
         amplitudes = tuple(p.texture * amplitude for amplitude in texture.amplitudes)
         scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)

@@ -199,7 +199,7 @@ class LocalisationScenarioParameters(AlgorithmSelection):
         return self
 
     @property
-    def preset(self) -> Site:
+    def site_preset(self) -> Site:
         """The site, with the optical depth of the case."""
         return localisation_site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)
 

@@ -106,7 +106,7 @@ def map_terrain(p: LocalisationScenarioParameters) -> int:
 
 def _create_world(p: LocalisationScenarioParameters, number: int) -> LocalisationWorld:
     return LocalisationWorld.from_parameters(
-        p.preset,
+        p.site_preset,
         p.terrain,
         bank_seed=p.location.bank_seed,
         terrain_number=number,

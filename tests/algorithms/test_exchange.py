@@ -366,6 +366,27 @@ def test_time_limit_of_a_case_also_limits_a_single_answer() -> None:
     assert error.value.fault is Fault.TIMED_OUT
 
 
+#: A program that starts slowly, and answers its first and third request slowly.
+SLOW_START = """
+time.sleep(1.5)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
+for number in (1, 2, 3):
+    input()
+    time.sleep(0.0 if number == 2 else 1.5)
+    print(json.dumps({"exchange": 3, "id": number}), flush=True)
+"""
+
+
+def test_start_up_is_not_part_of_the_time_for_a_case(tmp_path: Path) -> None:
+    limits = ExecutableLimits(time_s=60.0, total_s=1.0)
+    server = acquire_server(Command(tuple(write_program(tmp_path, SLOW_START).split()), True), limits)
+    server.send_request({"do": "start"}, start_up_s=60.0)
+    server.send_request({"do": "estimate"})
+    with pytest.raises(AlgorithmError, match="no answers to the case within 1 s") as error:
+        server.send_request({"do": "estimate"})
+    assert error.value.fault is Fault.TIMED_OUT
+
+
 def test_endless_standard_error_exceeds_the_output_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     program = RunningProgram((sys.executable, "-c", "print(1); input()"), ExecutableLimits())
     with monkeypatch.context() as patch:

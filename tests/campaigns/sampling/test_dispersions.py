@@ -1,5 +1,6 @@
 """Tests of dispersions: draws follow their distributions and do not depend on other dispersions."""
 
+import pickle
 from functools import cache
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy import stats
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.sampling.dispersion_base import TAIL, Dispersion
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
-from marsyard.campaigns.sampling.distributions import scipy_distributions, scipy_parameters
+from marsyard.campaigns.sampling.distributions import TruncationError, scipy_distributions, scipy_parameters
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import CampaignFile
 
@@ -208,3 +209,10 @@ def test_in_turn_integers_are_used_in_order_and_repeated(campaign_file: Campaign
     assert [campaign.draws(case)["terrain"] for case in range(8)] == [2, 3, 4, 2, 3, 4, 2, 3]
     with pytest.raises(ValidationError, match="must not be above"):
         make_dispersion(distribution="in-turn", low=3, high=2)
+
+
+def test_truncation_error_names_the_limits_also_after_pickling() -> None:
+    """A worker process sends the error to its parent."""
+    error = pickle.loads(pickle.dumps(TruncationError(90, 95.0, "no probability")))  # noqa: S301
+    assert str(error) == "truncate = [90, 95.0]: no probability"
+    assert error.reason == "no probability"

@@ -340,9 +340,9 @@ def test_variants_of_the_included_systems_are_valid() -> None:
 @pytest.mark.parametrize(
     ("campaign_name", "table", "find_site"),
     [
-        ("dimes-gusev", "photometry", lambda parameters: parameters.preset),
-        ("hda-mars", "photometry", lambda parameters: parameters.preset),
-        ("loc-jezero", "photometry", lambda parameters: parameters.preset),
+        ("dimes-gusev", "photometry", lambda parameters: parameters.site_preset),
+        ("hda-mars", "photometry", lambda parameters: parameters.site_preset),
+        ("loc-jezero", "photometry", lambda parameters: parameters.site_preset),
         ("vtt-montecarlo", "world.photometry", lambda parameters: parameters.world.lit_site),
     ],
 )

@@ -100,9 +100,24 @@ def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
 def test_images_can_be_repeated_or_black() -> None:
     """`corrupt_images` repeats the image before image 3, or sets image 1 to 0; its inputs do not change."""
     images = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
-    assert [int(entry[0, 0]) for entry in corrupt_images(images, 3, 0)] == [1, 2, 2]
-    assert [int(entry[0, 0]) for entry in corrupt_images(images, 0, 1)] == [0, 2, 3]
+    assert [int(entry[0, 0]) for entry in corrupt_images(images, repeated=3, black=0)] == [1, 2, 2]
+    assert [int(entry[0, 0]) for entry in corrupt_images(images, repeated=0, black=1)] == [0, 2, 3]
     assert [int(entry[0, 0]) for entry in images] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("lost_rows", [0.0, 0.25, 1.0])
+def test_incomplete_image_loses_its_lowest_rows(lost_rows: float) -> None:
+    images = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
+    corrupted = corrupt_images(images, repeated=0, black=0, incomplete=3, lost_rows=lost_rows)
+    received = 4 - int(4 * lost_rows)
+    assert [entry[:, 0].tolist() for entry in corrupted] == [[1] * 4, [2] * 4, [3] * received + [0] * (4 - received)]
+
+
+@pytest.mark.parametrize("numbers", [{"repeated": 1}, {"repeated": 4}, {"black": 4}, {"incomplete": -1}])
+def test_faults_of_missing_images_are_rejected(numbers: dict[str, int]) -> None:
+    images = [np.zeros((4, 4), dtype=np.uint16)] * 3
+    with pytest.raises(ValueError, match=f"{next(iter(numbers))} is image .*; allowed: . to 3, or 0 for none"):
+        corrupt_images(images, **{"repeated": 0, "black": 0, **numbers})
 
 
 def test_first_image_cannot_be_a_repeated_one() -> None:

@@ -79,7 +79,7 @@ def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
     )
     assert isinstance(parameters.flight, FlightFile)
     # origin of the file in the world, and gravity (m/s^2)
-    motion = parameters.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
+    motion = parameters.flight.create_trajectory(np.array([100.0, 200.0, 30.0]), 3.7)
     # The rotation by 90 deg turns east into south. The first image is 5 s after the start: 50 m south, 350 m lower.
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
     assert np.allclose(motion.state(0.0).velocity_m_s, [0.0, -10.0, -70.0])
@@ -98,7 +98,7 @@ def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
     values = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
     parameters = DescentScenarioParameters.model_validate({"flight": values})
     assert isinstance(parameters.flight, FlightFile)
-    state = parameters.flight.motion(np.zeros(3), 3.7).state(0.0)
+    state = parameters.flight.create_trajectory(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)
 
@@ -136,8 +136,8 @@ def test_times_since_1970_are_subtracted_before_rounding(tmp_path: Path, first_i
     flight = FlightFile.model_validate(
         {"file": str(tmp_path / "flight.parquet"), "axes": "enu", "first_image_s": first_image_s}
     )
-    assert flight.start_s == 1750000005.0
-    motion = flight.motion(np.zeros(3), 3.7)
+    assert flight.first_image_time_s == 1750000005.0
+    motion = flight.create_trajectory(np.zeros(3), 3.7)
     assert motion.span_s[0] == -5.0
     forces = motion.motion(np.linspace(0.0, 15.0, 999)).specific_forces_m_s2
     # rounding errors of the positions: 2200 m x 2^-53 x 12 / (2.5 ms)^2 = 5e-7 m/s^2

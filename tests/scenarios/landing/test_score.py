@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
+from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety, Tracks
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.hazards import HazardMaps
 from marsyard.algorithms.hda.products import MappedGround
@@ -23,10 +23,12 @@ from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.map_score import SampledMap, map_errors, map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import landing_row, site_row
+from marsyard.scenarios.landing.score import landing_row, motion_row, site_row
+from marsyard.scenarios.landing.simulation import RenderedFlight
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
+from marsyard.sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 SITE_REPORTED, NO_SITE_REPORTED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
@@ -185,3 +187,25 @@ def test_unknown_cells_of_a_map_are_counted() -> None:
     row = stage_row(HdaDetails((VIEW, VIEW), ground=make_ground(elevation, safety)))
     assert row["empty_fraction"] == pytest.approx(2 / 20)
     assert row["unknown_fraction"] == pytest.approx(5 / 20)
+
+
+@pytest.mark.parametrize("error_rows", [-0.8, 0.8])
+def test_true_track_starts_at_the_middle_of_the_summed_rows(error_rows: float) -> None:
+    """Both images are taken at one pose, so that true tracks have no displacement; an error of 0.8 rows is correct.
+
+    The true ray is that of the third of four rows, 0.125 rows below the middle of their sum. The limit is 1 px.
+    """
+    p = LandingScenarioParameters.model_validate(
+        {
+            "terrain": {"samples": 512},
+            "detector": {"preset": "xc-55", "rows_summed": 4},
+            "image_poses": {"baseline_fraction": 0.0},
+        }
+    )
+    case = RenderedFlight.simulate(p, Streams(1, "summed rows", 0))
+    rows, columns = case.pair.counts[0].shape
+    v, u = np.mgrid[20 : rows - 20 : 20, 20 : columns - 20 : 20].reshape(2, -1).astype(np.float64)
+    first, second = np.column_stack([u, v]), np.column_stack([u, v + error_rows])
+    tracks = Tracks(first, second, np.ones(u.size), np.ones(u.size, dtype=np.bool_))
+    row = motion_row(HdaDetails((VIEW, VIEW), tracks=tracks), case.flight, case.pair)
+    assert row["tracks_correct"] == row["features_in_view"] == u.size
