@@ -16,8 +16,8 @@ from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
+from marsyard.reports.images import thumbnail
 from marsyard.reports.presentation import Cause, system_presentation
-from marsyard.reports.products import thumbnail
 from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict

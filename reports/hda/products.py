@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.reports.products import check_shape, numeric_product, read_arrays, to_matrix
+from marsyard.reports.products import array_of_shape, numeric_product, read_arrays, to_matrix
 
 MapArray = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
@@ -126,7 +126,7 @@ def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
     names = ("rotation", "translation", "true_rotation", "true_translation", "frustum_0", "frustum_1")
     shapes = ((3, 3), (3,), (3, 3), (3,), (4, 3), (4, 3))
     arrays = read_arrays(products, dict(zip(names, shapes, strict=True)), finite=True)
-    points = check_shape(products.get("sparse_points"), None, 3)
+    points = array_of_shape(products.get("sparse_points"), None, 3)
     if arrays is None or points is None or not len(points):
         return None
     rotation, translation, true_rotation, true_translation, first_rays, second_rays = arrays
@@ -168,7 +168,7 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (len(_Limits._fields),)}, finite=True)
-    pixels, cell_m = check_shape(products.get("map_pixels"), *elevation_m.shape, 2), _read_positive(products, "cell")
+    pixels, cell_m = array_of_shape(products.get("map_pixels"), *elevation_m.shape, 2), _read_positive(products, "cell")
     if frames is None or pixels is None or cell_m is None:
         return None
     corner_m, apriori, surface_from_camera, world_from_surface, stored_limits = frames
@@ -210,7 +210,7 @@ def _extrapolate_pixels(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np
 
 def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
     """Read the ground truth; None if missing."""
-    positions = check_shape(products.get("true_positions"), None, None, 2)
+    positions = array_of_shape(products.get("true_positions"), None, None, 2)
     heights = to_matrix(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
     spacing_m = _read_positive(products, "true_spacing")

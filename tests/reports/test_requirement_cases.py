@@ -19,9 +19,9 @@ from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
+from marsyard.reports.images import thumbnail
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation
-from marsyard.reports.products import thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
