@@ -74,28 +74,6 @@ class Sample:
         return np.asarray(self.values[order][indices].mean(axis=1))
 
 
-@dataclass(frozen=True)
-class Metric:
-    """One metric of a campaign: a success rate with the values 0 and 1, or an error's magnitude, for each case."""
-
-    name: str
-    is_rate: bool
-    sample: Sample
-
-    @property
-    def finite_values(self) -> Float[np.ndarray, " finite"]:
-        """Values of the cases that are not excluded."""
-        return self.sample.finite_cases().values
-
-    @property
-    def summary(self) -> float:
-        """The rate, or the median error; NaN for no cases."""
-        values = self.finite_values
-        if values.size == 0:
-            return math.nan
-        return float(values.mean() if self.is_rate else np.median(values))
-
-
 def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000) -> float:
     """Compute the two-sided p-value of the difference of two sets; NaN for too few cases.
 
