@@ -271,12 +271,13 @@ def _render_from_above(scene: Scene, camera: CameraModel, position: np.ndarray, 
 
 
 def run_sun(quick: bool) -> Iterator[Measure]:
-    """Compare direction and flux of the sun's disc in the image with those of the sun."""
-    camera = cameras()["MER navcam, CAHVOR, 45 deg"]
+    """Compare direction and flux of the sun's disc in the image with those of the sun.
+
+    The disc covers 40 pixels, and the coverage of a pixel at its edge is approximate: the errors are random.
+    """
+    camera, rng = cameras()["MER navcam, CAHVOR, 45 deg"], np.random.default_rng(3)
     direction_errors, flux_errors = [], []
-    for azimuth_deg, elevation_deg in (
-        ((90.0, 12.0), (97.0, 16.0)) if quick else ((90.0, 12.0), (97.0, 16.0), (80.0, 5.0))
-    ):
+    for azimuth_deg, elevation_deg in rng.uniform((82.0, 5.0), (98.0, 16.0), (3 if quick else 14, 2)):
         sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
         law = Photometry(sky_fraction=0.3, sky=DustySky(0.5, 0.95, 0.65))
         pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
@@ -289,17 +290,13 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         centre = np.array([(sun_radiance * columns).sum(), (sun_radiance * rows).sum()]) / sun_radiance.sum()
         direction_errors.append(float(np.linalg.norm(centre - camera.project(1e9 * sun.direction)[0])))
         solid_angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
-        flux_errors.append(abs(float((sun_radiance * solid_angle).sum()) / np.pi - 1.0))
-    claim = "position of the sun's disc, difference from the sun's direction"
-    yield Measure(
-        claim,
-        max(direction_errors),
-        "px",
-        find_limit(claim),
-        f"{len(direction_errors)} positions of the sun in navcam images",
-    )
-    claim = "flux of the sun's disc compared with direct sunlight"
-    yield Measure(claim, max(flux_errors), "", find_limit(claim), "the same images")
+        flux_errors.append(float((sun_radiance * solid_angle).sum()) / np.pi - 1.0)
+    claim = "position of the sun's disc, RMS difference from the sun's direction"
+    how = f"{len(direction_errors)} positions of the sun in navcam images"
+    yield Measure(claim, float(np.sqrt(np.mean(np.square(direction_errors)))), "px", find_limit(claim), how)
+    claim = "flux of the sun's disc compared with direct sunlight, RMS difference"
+    how = f"the same images; mean difference {np.mean(flux_errors):+.2%}"
+    yield Measure(claim, float(np.sqrt(np.mean(np.square(flux_errors)))), "", find_limit(claim), how)
 
 
 _SUN_10, _SUN_20, _SUN_30 = (10.0, 10.0), (20.0, 20.0), (30.0, 30.0)

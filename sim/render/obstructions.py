@@ -140,8 +140,8 @@ class Shelter:
 
         The vector of a polygon is the sum over its edges of half the angle of the edge times the unit vector
         perpendicular to the edge and the position (Lambert 1760). The visible faces of a convex body do not overlap;
-        their common edges cancel. The rest is the outline; its edges are straight lines across the aureole, each of which
-        hides as if it was alone.
+        their common edges cancel. The rest is the outline; its edges are straight lines across the aureole, each of
+        which hides as if it was alone.
         """
         is_near = active & (dr.norm(Array3f(self.centre - position)) < self.reach)
         return where(is_near, lambda: self._trace_outline(position), Hidden(Array3f(0.0), Float(0.0)))

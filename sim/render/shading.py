@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, where
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
 from marsyard.sim.render.clouds import Clouds
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.obstructions import Hidden, Obstructions

@@ -175,9 +175,9 @@ class DustySky:
     with the Henyey-Greenstein phase function P, optical depth tau, single-scattering albedo w, mean cosine g of the
     scattering angle, and the sines of elevation mu of the view and mu0 of the sun. The extinction depth is
     ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, is part of the direct sunlight
-    (Joseph et al. 1976), in which it is the aureole around the disc. Light scattered several times is isotropic: it adds ``J (1 - exp(-t / mu))``, so that the
-    irradiance of level ground without the peak is `Photometry.sky_fraction`. If single scattering exceeds this
-    irradiance, it is scaled down.
+    (Joseph et al. 1976), in which it is the aureole around the disc. Light scattered several times is isotropic: it
+    adds ``J (1 - exp(-t / mu))``, so that the irradiance of level ground without the peak is `Photometry.sky_fraction`.
+    If single scattering exceeds this irradiance, it is scaled down.
     """
 
     optical_depth: float
