@@ -18,8 +18,8 @@ from marsyard.campaigns.store.table import refresh_table
 from marsyard.reports import campaign_diff, figures
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.images import thumbnail
 from marsyard.reports.presentation import write_case_figures
-from marsyard.reports.products import thumbnail
 from marsyard.reports.report_file import PAGE_FILE
 from marsyard.reports.requirement_cases import CaseFinder, CaseSummary
 from marsyard.reports.stored import read_run

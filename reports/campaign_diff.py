@@ -12,19 +12,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.parameter_paths import leaves
-from marsyard.reports import populations, rates
-from marsyard.reports.column_selection import primary_metric
-from marsyard.reports.column_values import numbers
-from marsyard.reports.decision import requirement_masks
-from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports import rates
+from marsyard.reports.metrics import Metric, list_metrics
 from marsyard.reports.section import Grid
-from marsyard.reports.statistics.difference_tests import Metric, Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.difference_tests import Sample, correct_holm, difference_p_value
 from marsyard.reports.statistics.paired_tests import compare_successes, symmetry_p_value
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import NOTHING, label, number, p_text, percent
+from marsyard.reports.wording import NOTHING, number, p_text, percent
 
 
 def metric_text(metric: Metric) -> str:
@@ -49,37 +45,6 @@ class MetricComparison:
     def name(self) -> str:
         """Name of the metric."""
         return self.first.name
-
-
-def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
-    """Return the rows without the nominal case, and the metrics that can be compared between campaigns.
-
-    Metrics: success of each requirement, errors, "answered", and "came to an end" (the case was completed).
-    """
-    frame = read_sampling_design(run.definition).exclude_nominal_case(run.all_cases)
-    metrics: dict[str, Metric] = {}
-    terrains = number_stored_terrains(frame)
-
-    def add_metric(name: str, values: Float[np.ndarray, " n"], title: str = "", *, is_rate: bool = True) -> None:
-        metrics[name] = Metric(title or name, is_rate, Sample(values, terrains))
-
-    error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
-    for requirement in run.requirements:
-        name, metric = str(requirement.get("id", "?")), str(requirement.get("metric", ""))
-        masks = requirement_masks(frame, requirement)
-        if masks is None:
-            continue
-        member, success = masks
-        add_metric(name, np.where(member, success.astype(np.float64), np.nan))
-        if metric in frame and isinstance(requirement.get("bound"), int | float):
-            error_columns[metric] = None
-    for column in filter(None, error_columns):
-        magnitude = np.abs(numbers(frame, column))
-        add_metric(column, np.where(np.isfinite(magnitude), magnitude, np.nan), label(column), is_rate=False)
-    if populations.is_flag(frame, "answered"):
-        add_metric("answered", populations.population_mask(frame, "valid").astype(np.float64))
-    add_metric("came to an end", populations.population_mask(frame, "completed").astype(np.float64))
-    return frame, list(metrics.values())
 
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
@@ -146,16 +111,6 @@ def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str
         | {"p": None if math.isnan(row.p_value) else row.p_value}
         for row in comparisons
     ]
-
-
-def number_stored_terrains(frame: pd.DataFrame) -> Int[np.ndarray, " n"]:
-    """Return the stored terrain numbers of cases, which are comparable between campaigns; 0 without any terrain."""
-    groups = rates.terrain_groups(frame)
-    if groups is None:
-        return np.zeros(len(frame), dtype=np.int64)
-    terrains = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    # negative numbers: one for each case of unknown terrain, and one for each terrain without a number
-    return np.where(np.isfinite(terrains), np.nan_to_num(terrains), -1.0 - groups).astype(np.int64)
 
 
 def _unpaired_p_value(first: Metric, second: Metric, share_terrains: bool) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -25,6 +25,29 @@ Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
 #: Kinds of cases that the record counts on each terrain: successes (0) and failures (1) of the population and other
 #: cases (2) of the first look, then the same kinds of later looks (3 to 5).
 _KINDS_PER_LOOK, _KINDS = 3, 6
+
+
+class _TerrainRow(NamedTuple):
+    """A row of the record of confirmations: cases on one terrain, or on each of several terrains with equal counts.
+
+    - counts: number of cases of each kind
+    - label: name of the terrain, if other confirmations can use it; otherwise None
+    - repeats: number of terrains with these counts; 1 for a terrain with a name
+    """
+
+    counts: Sequence[int]
+    label: str | None = None
+    repeats: int = 1
+
+    def to_list(self) -> list[Any]:
+        """Return the counts, then the name of the terrain (a text), or the number of terrains (an integer)."""
+        return [*self.counts, self.repeats if self.label is None else self.label]
+
+    @classmethod
+    def from_list(cls, values: Sequence[Any]) -> _TerrainRow:
+        """Create the row from the values of `to_list`."""
+        *counts, last = values
+        return cls(counts, label=last) if isinstance(last, str) else cls(counts, repeats=int(last))
 
 
 @dataclass(frozen=True)
@@ -115,15 +138,18 @@ class CaseEvidence:
         kinds = np.select([self.success, self.member], [0, 1], 2) + np.where(self.in_first_look, 0, _KINDS_PER_LOOK)
         counts = np.bincount(groups * _KINDS + kinds, minlength=terrains * _KINDS).reshape(terrains, _KINDS).tolist()
         if self.labels is not None:
-            return [[*values, label] for values, label in zip(counts, self.labels, strict=True)]
-        return [[*values, number] for values, number in sorted(Counter(map(tuple, counts)).items())]
+            return [_TerrainRow(row, label).to_list() for row, label in zip(counts, self.labels, strict=True)]
+        return [_TerrainRow(row, repeats=n).to_list() for row, n in sorted(Counter(map(tuple, counts)).items())]
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]], *, is_first: bool) -> CaseEvidence:
         """Create the results from the rows of `to_rows`; `is_first`: whether they are of the first confirmation."""
-        labels = tuple(str(row[_KINDS]) for row in rows) if rows and isinstance(rows[0][_KINDS], str) else None
-        terrains = [row[:_KINDS] for row in rows for _ in range(1 if labels is not None else int(row[_KINDS]))]
-        counts = np.array(terrains, dtype=np.int64).reshape(-1, _KINDS)
+        terrain_rows = [_TerrainRow.from_list(row) for row in rows]
+        names = tuple(row.label for row in terrain_rows if row.label is not None)
+        # either all terrains have a name or none
+        labels = names or None
+        counts_by_terrain = [row.counts for row in terrain_rows for _ in range(row.repeats)]
+        counts = np.array(counts_by_terrain, dtype=np.int64).reshape(-1, _KINDS)
         kinds = np.repeat(np.tile(np.arange(_KINDS), len(counts)), counts.ravel())
         groups = np.repeat(np.repeat(np.arange(len(counts)), _KINDS), counts.ravel())
         kind_of_look, in_first_look = kinds % _KINDS_PER_LOOK, (kinds < _KINDS_PER_LOOK) & is_first

@@ -210,7 +210,7 @@ def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, 
         status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
         return replace(with_counts, status=status, reason=reason)
     in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
-    looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
+    looks = Looks(in_first_look, sampling.allowed_risk_fraction(len(frame)))
     bounded = _add_bounds(with_counts, evidence, looks)
     additional, verdict_with_bounds = bounded.additional_cases or 0, replace(bounded, additional_cases=None)
     status = verdict_with_bounds.confident_status

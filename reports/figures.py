@@ -38,6 +38,11 @@ _MAX_STEPS = 2000
 #: axis, and at the upper edge of the axes strokes of cases without an error.
 _HOLLOW_POSITION, _TOP = 1.06, 1.12
 _LEGEND_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
+#: Limit of a scatter relative to the largest error, to the end of the axis if larger errors lie beyond it, and to the
+#: radius of the requirement's circle.
+_ERROR_MARGIN, _EDGE_MARGIN, _CIRCLE_MARGIN = 1.08, 1.05, 1.15
+#: Half width of a scatter's axes relative to its limit, at which the hollow markers of larger errors are drawn.
+_HOLLOW_MARGIN = 1.04
 
 
 @dataclass(frozen=True)
@@ -81,11 +86,7 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
     if not finite.any():
         return None
     ellipse = error_ellipse(points, ELLIPSE)
-    limit = 1.08 * float(np.abs(points[finite]).max()) or 1.0
-    if not enlarged and bound is not None and bound > 0.0:
-        # the axes include the circle and end at `axis_edge`
-        inner_limit = 1.05 * axis_edge(np.abs(points[finite]).max(axis=1), bound)
-        limit = min(limit, inner_limit) if limit > 1.15 * bound else 1.15 * bound
+    limit = _scatter_limit(np.abs(points[finite]).max(axis=1), None if enlarged else bound)
     if enlarged and ellipse is not None:
         limit = max(limit, ellipse.half_extent)
     figure, axes = new_axes(5.0, 4.9)
@@ -110,10 +111,26 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
         axes.plot([], [], ":", color=INK, label=f"{format_fraction(ELLIPSE)} ellipse")
     axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
-    axes.set(xlim=(-limit * 1.04, limit * 1.04), ylim=(-limit * 1.04, limit * 1.04), aspect="equal")
+    half_width = limit * _HOLLOW_MARGIN
+    axes.set(xlim=(-half_width, half_width), ylim=(-half_width, half_width), aspect="equal")
     axes.set(xlabel=label(components[0]), ylabel=label(components[1]))
     axes.legend(bbox_to_anchor=(0.5, -0.14), **_LEGEND_BELOW)
     return figure
+
+
+def _scatter_limit(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
+    """Compute the largest x or y that a scatter draws to scale.
+
+    Without a bound, all errors are inside. With a bound, the requirement's circle is inside, and errors are inside up
+    to `axis_edge`.
+
+    magnitudes: the larger one of |x| and |y| of each case
+    """
+    limit = _ERROR_MARGIN * float(magnitudes.max()) or 1.0
+    if bound is None or bound <= 0.0:
+        return limit
+    circle_limit = _CIRCLE_MARGIN * bound
+    return circle_limit if limit <= circle_limit else min(limit, _EDGE_MARGIN * axis_edge(magnitudes, bound))
 
 
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:

@@ -19,8 +19,8 @@ from marsyard.reports.wording import NOTHING
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has up to half a megabyte.
 CASES_PER_GROUP = 2
-#: Number of listed cases without a metric: as many as of the three groups.
-_CASES_WITHOUT_METRIC = 3 * CASES_PER_GROUP
+#: Number of listed stored cases if cases are not grouped: as many as of the three groups.
+_UNGROUPED_CASES = 3 * CASES_PER_GROUP
 #: Maximum number of violations that the gallery shows.
 MAX_SHOWN_VIOLATIONS = 6
 #: Fixed seeds of the random selection, for reproducible reports.
@@ -45,8 +45,12 @@ def gallery_views(run: StoredRun, violations: Sequence[int]) -> list[GalleryView
 def gallery_cases(run: StoredRun, violations: Sequence[int] = ()) -> list[int]:
     """List the cases of the gallery, which have stored products: first violations, then the shown case.
 
-    Cases of three groups follow, if fewer than `MAX_SHOWN_VIOLATIONS` violations are listed: the largest errors, no
-    answer, and random cases. Without a metric, the first stored cases follow instead.
+    The shown case (`StoredRun.shown_case`) is the one that the campaign recorded for its report; if its products are
+    not stored, it is the first stored case. Cases of three groups follow, if fewer than `MAX_SHOWN_VIOLATIONS`
+    violations are listed: the largest errors, no answer, and random cases.
+
+    Cases are not grouped if at most one case is stored, if the campaign has no metric, or if its rows have no column
+    `case`. Then the first `_UNGROUPED_CASES` stored cases follow the violations; the first of them is the shown case.
 
     violations: those that the page lists by requirement
     """
@@ -54,7 +58,7 @@ def gallery_cases(run: StoredRun, violations: Sequence[int] = ()) -> list[int]:
     stored_cases = list(run.stored_cases)
     metric = primary_metric(run.frame, run.requirements)
     if run.shown_case is None or len(stored_cases) == 1 or metric is None or "case" not in run.all_cases:
-        return list(dict.fromkeys([*shown_violations, *stored_cases[:_CASES_WITHOUT_METRIC]]))
+        return list(dict.fromkeys([*shown_violations, *stored_cases[:_UNGROUPED_CASES]]))
     first = list(dict.fromkeys([*shown_violations, run.shown_case]))
     if len(shown_violations) == MAX_SHOWN_VIOLATIONS:
         return first

@@ -1,15 +1,18 @@
-"""View of images with marks: a system fills panels with images, points, lines and labels, which are drawn here."""
+"""Images of a case: panels, which a system fills with images, points, lines and labels, and a preview."""
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from marsyard.reports.figure_style import INK, hide_frame, in_page_style
+from marsyard.reports.products import Products
 
 Image = Float[np.ndarray, "_ _"]
 Pixels = Float[np.ndarray, "... 2"]
@@ -123,3 +126,32 @@ def draw_images(images: Sequence[Image]) -> Figure:
     rows, columns = images[0].shape
     panels = [Panel(image, f"Image {number}") for number, image in enumerate(images, start=1)]
     return draw_panels([panels], (12.0, 12.0 / len(images) * rows / columns + 0.35))
+
+
+#: Size of thumbnails, pixels, and their JPEG quality.
+_THUMBNAIL_PX, _THUMBNAIL_QUALITY = 96, 70
+#: Minimum size of an image, pixels. From this ratio of its sides, an image has binned rows or columns: it is scaled to
+#: a square, not cropped.
+_MIN_IMAGE_PX, _MAX_ASPECT = 48, 2.0
+
+
+def thumbnail(products: Products) -> str:
+    """Return a square preview of a case's last image as a data URI; empty if the products contain no image.
+
+    An image is a product at the top level with integer values and two dimensions.
+    """
+    images = [value for value in products.values() if isinstance(value, np.ndarray) and value.ndim == 2]
+    images = [image for image in images if np.issubdtype(image.dtype, np.integer) and min(image.shape) >= _MIN_IMAGE_PX]
+    if not images:
+        return ""
+    image = images[-1].astype(np.float32)
+    rows, columns = image.shape
+    if columns < _MAX_ASPECT * rows and rows < _MAX_ASPECT * columns:
+        size = min(rows, columns)
+        top, left = (rows - size) // 2, (columns - size) // 2
+        image = image[top : top + size, left : left + size]
+    low, high = np.percentile(image, (1.0, 99.0))
+    small = cv2.resize(image, (_THUMBNAIL_PX, _THUMBNAIL_PX), interpolation=cv2.INTER_AREA)
+    grey = np.clip((small - low) * (255.0 / max(high - low, 1.0)), 0.0, 255.0).astype(np.uint8)
+    _, jpeg = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode()}"

@@ -58,8 +58,8 @@ class JointEvidence:
             joined = part if joined is None else joined.join(part)
         return joined
 
-    def find_block(self, cases: int) -> str:
-        """Describe an unfinished confirmation, which blocks PASS; empty if all are finished.
+    def describe_obstacle(self, cases: int) -> str:
+        """Describe an unfinished confirmation, which prevents PASS; empty if all are finished.
 
         cases: number of cases of the run
         """
@@ -84,10 +84,10 @@ class JointEvidence:
 
     def is_qualified(self, requirement_id: str) -> bool:
         """Whether PASS of a requirement needs a decision of a person."""
-        return bool(self.registration_problem) or self.has_failed_variant(requirement_id)
+        return bool(self.registration_problem) or self.has_unpassed_variant(requirement_id)
 
-    def has_failed_variant(self, requirement_id: str) -> bool:
-        """Whether an earlier claim about the same campaign has not passed a requirement."""
+    def has_unpassed_variant(self, requirement_id: str) -> bool:
+        """Whether an earlier claim about the same campaign has not passed a requirement, or is not finished."""
         variants = [
             entries[-1] for entries in self.related if self.own is not None and is_variant(entries[-1], self.own)
         ]
@@ -156,14 +156,16 @@ def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdi
             "new claim."
         )
         return replace(verdict, status=Status.FAIL, reason=reason, additional_cases=None)
-    block = joint.find_block(cases)
-    if block and verdict.status.is_met:
-        return verdict.withhold(block)
+    obstacle = joint.describe_obstacle(cases)
+    if obstacle and verdict.status.is_met:
+        return verdict.withhold(obstacle)
     if verdict.status is not Status.PASS:
         return verdict
     if joint.registration_problem:
         return replace(verdict, status=Status.UNREGISTERED)
-    return replace(verdict, status=Status.OTHER_CLAIMS) if joint.has_failed_variant(verdict.requirement_id) else verdict
+    return (
+        replace(verdict, status=Status.OTHER_CLAIMS) if joint.has_unpassed_variant(verdict.requirement_id) else verdict
+    )
 
 
 def describe_contribution(verdict: Verdict, own: RequirementEvidence | None, joint: JointEvidence) -> Verdict:

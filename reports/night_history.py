@@ -12,7 +12,8 @@ import numpy as np
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.record import utc_now
-from marsyard.reports.statistics.difference_tests import Metric, Sample
+from marsyard.reports.metrics import Metric
+from marsyard.reports.statistics.difference_tests import Sample
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA_VERSION = 1

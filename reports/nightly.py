@@ -8,8 +8,9 @@ from itertools import takewhile
 
 import numpy as np
 
+from marsyard.reports.metrics import Metric
 from marsyard.reports.night_history import FINISHED, History, MetricChange, Night, NightCampaign
-from marsyard.reports.statistics.difference_tests import Metric, Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.difference_tests import Sample, correct_holm, difference_p_value
 from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Maximum probability of at least one false alarm in a night in which no metric has changed.

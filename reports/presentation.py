@@ -88,7 +88,8 @@ class Presentation:
     - sections: functions that create sections after the sections common to all campaigns
     - first: functions that create sections before the common sections
     - outcomes: enumerations of outcomes; each value describes its outcome
-    - explain: return the cause of a row's violation of a requirement with this metric; None if it is unknown
+    - explain: return the cause of a row's violation of a requirement with this metric; None if it is unknown. The row
+      also contains the values of the campaign's file by parameter path, such as `lander.max_slope_deg`
     """
 
     cases: Sequence[CaseKind] = ()

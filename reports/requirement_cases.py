@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from marsyard.campaigns.definition.parameter_paths import leaves
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
+from marsyard.reports.images import thumbnail
 from marsyard.reports.presentation import Cause, system_presentation
-from marsyard.reports.products import thumbnail
 from marsyard.reports.section import Grid
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, label, number, percent
 from marsyard.scenarios.columns import split_unit
@@ -137,6 +138,7 @@ class CaseFinder:
         self._frame = run.all_cases
         presentation = system_presentation(str(run.recorded("scenario") or ""))
         self._explain = None if presentation is None else presentation.explain
+        self._parameters = dict(leaves(table(run.definition.get("parameters"))))
         margin_columns = {str(entry.get("id")): entry.get("margin") for entry in run.requirements}
         self._evaluated = [
             _Evaluated(verdict, margins, graded=math.isfinite(verdict.bound) or bool(margin_columns[name]))
@@ -247,7 +249,8 @@ class CaseFinder:
     def _find_cause(self, item: _Evaluated, values: Mapping[str, Any]) -> Cause | None:
         if self._explain is None or values.get("outcome") in ENGINE_FAILURES:
             return None
-        return self._explain(values, item.verdict.metric)
+        # sampled parameters are columns, whose values replace those of the campaign's file
+        return self._explain({**self._parameters, **values}, item.verdict.metric)
 
     def _describe_error(self, item: _Evaluated, values: Mapping[str, Any], violates: bool) -> str:
         """Describe the metric of a case relative to its limit, or why it has none."""

@@ -20,12 +20,16 @@ from marsyard.reports.wording import count, format_fraction
 class TerrainSupply:
     """Number of terrains that the cases of a campaign can use.
 
+    - table_name: table of the parameters `bank` and `terrain`: `location` or `world`
     - key: parameter that sets this number: size of the terrain bank, or range of the dispersed terrain number
+    - is_bank_size: whether this parameter is the size of the terrain bank
     - in_turn: whether the cases use the terrains in turn; otherwise terrains are drawn at random with replacement
     """
 
     terrains: int
+    table_name: str
     key: str
+    is_bank_size: bool = False
     in_turn: bool = False
 
     def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
@@ -37,12 +41,10 @@ class TerrainSupply:
             shortage = (
                 f"Terrains are drawn at random and can repeat, so the {supply_text} are unlikely to give as many."
             )
-        # "location" or "world": table of the parameters `bank` and `terrain`
-        table_name = self.key.removeprefix('dispersions."').partition(".")[0]
-        options = f"--set {table_name}.bank={min_terrains}"
-        if not self.in_turn or not self.key.endswith(".bank"):
+        options = f"--set {self.table_name}.bank={min_terrains}"
+        if not self.in_turn or not self.is_bank_size:
             dispersion = f'{{distribution="in-turn",low=0,high={min_terrains - 1}}}'
-            options += f" --set 'dispersions.\"{table_name}.terrain\"={dispersion}'"
+            options += f" --set 'dispersions.\"{self.table_name}.terrain\"={dispersion}'"
         return (
             f"To show a success rate of {requirement}, the cases must include at least {min_terrains:,} different "
             f"terrains. {shortage} Run the campaign again with {min_terrains:,} cases, each on a terrain of its own: "
@@ -53,19 +55,19 @@ class TerrainSupply:
 def read_terrain_supply(definition: Mapping[str, Any]) -> TerrainSupply | None:
     """Read the number of available terrains from a definition; None if unknown."""
     parameters, dispersions = table(definition.get("parameters")), table(definition.get("dispersions"))
-    for name in ("location", "world"):
-        bank = table(parameters.get(name)).get("bank")
+    for table_name in ("location", "world"):
+        bank = table(parameters.get(table_name)).get("bank")
         if not isinstance(bank, int):
             continue
-        path = f"{name}.terrain"
+        path = f"{table_name}.terrain"
         dispersion = table(dispersions.get(path))
         if not dispersion:
-            return TerrainSupply(1, path)
+            return TerrainSupply(1, table_name, path)
         in_turn = dispersion.get("distribution") == "in-turn"
         low, high = dispersion.get("low"), dispersion.get("high")
         if isinstance(low, int) and isinstance(high, int):  # otherwise a formula of the bank's size
-            return TerrainSupply(min(high - low + 1, bank), f'dispersions."{path}"', in_turn)
-        return TerrainSupply(bank, f"{name}.bank", in_turn)
+            return TerrainSupply(min(high - low + 1, bank), table_name, f'dispersions."{path}"', in_turn=in_turn)
+        return TerrainSupply(bank, table_name, f"{table_name}.bank", is_bank_size=True, in_turn=in_turn)
     return None
 
 
@@ -125,7 +127,7 @@ class SamplingDesign:
             return self
         return replace(self, max_cases=None, first_look=planned_looks(self.max_cases)[0].cases)
 
-    def risk_fraction_at(self, cases: int) -> float:
+    def allowed_risk_fraction(self, cases: int) -> float:
         """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""
         return 1.0 if self.max_cases is None else risk_fraction_at(planned_looks(self.max_cases), cases)
 

@@ -8,9 +8,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from marsyard.reports.metrics import Metric
 from marsyard.reports.night_history import FINISHED, History, NightCampaign
 from marsyard.reports.nightly import NightComparison, find_changes, list_comparisons
-from marsyard.reports.statistics.difference_tests import Metric, Sample
+from marsyard.reports.statistics.difference_tests import Sample
 
 #: Assignments of cases to terrains.
 KINDS = ("a bank of 12 terrains", "20 new terrains every night", "a terrain for each case")

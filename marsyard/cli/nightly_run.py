@@ -28,8 +28,8 @@ from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.cli.errors import Exit
 from marsyard.cli.outcome import evaluate_and_store
-from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.metrics import list_metrics
 from marsyard.reports.night_history import History, MetricChange, NightCampaign
 from marsyard.reports.nightly import format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters

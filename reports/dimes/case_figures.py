@@ -17,7 +17,7 @@ from matplotlib.transforms import Bbox
 from scipy import ndimage
 
 from marsyard.reports.images import DASHED, Image, Mark, Panel, draw_images, draw_panels, square
-from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.products import Products, array_of_shape, numeric_product, to_matrix
 
 #: Colours of templates, matches and search windows, and of the overlap and the zero-phase point.
 TEMPLATE, MATCH, WINDOW, HINT = "#ff4b3e", "#35d46b", "#4aa3ff", "#f2e35a"
@@ -68,7 +68,7 @@ def is_dimes_case(products: Products) -> bool:
 
 def read_tracks(products: Products) -> list[Track]:
     """Read the tracks of a case; rows with an unknown pair or template are skipped."""
-    table = check_shape(products.get("tracks"), None, None)
+    table = array_of_shape(products.get("tracks"), None, None)
     names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]
     if table is None or table.shape[1] != len(names):
         return []
@@ -77,7 +77,7 @@ def read_tracks(products: Products) -> list[Track]:
         if row.get("pair") in _PAIRS and row.get("template") in _TEMPLATE_NUMBERS:
             pair, template = int(row["pair"]), int(row["template"])
             patch, window = (to_matrix(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
-            position = check_shape(products.get(f"match_{pair}_{template}"), 2)
+            position = array_of_shape(products.get(f"match_{pair}_{template}"), 2)
             tracks.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
     return tracks
 
@@ -98,7 +98,7 @@ def _arrange_pair(products: Products, pair: int) -> dict[str, list[Panel]]:
     """Create the non-empty rows of panels of a pair, from top to bottom."""
     images = [read_square_image(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     tracks = _drawn_tracks(products, pair)
-    lattices = [check_shape(products.get(f"rectified_{pair}_{index}"), None, None, 2) for index in (0, 1)]
+    lattices = [array_of_shape(products.get(f"rectified_{pair}_{index}"), None, None, 2) for index in (0, 1)]
     rows = {}
     if any(lattice is not None for lattice in lattices):
         panels = [_rectified_panel(products, images[index], lattices[index], tracks, pair, index) for index in (0, 1)]
@@ -158,7 +158,8 @@ def _rectified_panel(
     `rectified_frame_<pair>` contains west and north edge and spacing of the lattice, metres; `gsd_<pair>` is the pixel
     size of templates and windows, metres (`marsyard.algorithms.dimes.products`).
     """
-    frame, gsd = check_shape(products.get(f"rectified_frame_{pair}"), 3), numeric_product(products.get(f"gsd_{pair}"))
+    frame = array_of_shape(products.get(f"rectified_frame_{pair}"), 3)
+    gsd = numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or frame is None:
         return Panel()
     rectified = _rectify(image, lattice)
@@ -234,7 +235,7 @@ def _hint_marks(products: Products, pair: int, index: int, shape: tuple[int, ...
 
 def _visible_overlap(products: Products, pair: int, shape: tuple[int, ...]) -> Float[np.ndarray, "_ 2"] | None:
     """Return the outline of the overlap (u, v) in the first image of a pair; None if no part of it is in the image."""
-    polygon = check_shape(products.get(f"overlap_{pair}"), None, 2)
+    polygon = array_of_shape(products.get(f"overlap_{pair}"), None, 2)
     if polygon is None or not polygon.size or not np.isfinite(polygon).all():
         return None
     image_box = Bbox([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]])
@@ -245,7 +246,7 @@ def _visible_zero_phase(
     products: Products, pair: int, index: int, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "2"] | None:
     """Return the zero-phase point (u, v) in an image of a pair; None if it is not in the image."""
-    pixels = check_shape(products.get(f"zero_phase_{pair}"), 2, 2)
+    pixels = array_of_shape(products.get(f"zero_phase_{pair}"), 2, 2)
     if pixels is None:
         return None
     is_inside = ((pixels[index] >= 0.0) & (pixels[index] < shape[::-1])).all()

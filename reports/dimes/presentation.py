@@ -12,7 +12,7 @@ from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import ignition_section, landing_section, sensitivity_section
 from marsyard.reports.dimes.stream_case import STREAM_CASE
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
-from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.products import Products, array_of_shape, numeric_product, to_matrix
 from marsyard.reports.wording import NOTHING, label, note_text, number, percent
 
 #: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.
@@ -56,7 +56,7 @@ def _create_track_table(products: Products) -> tuple[list[str], list[TableRow]]:
     positions = {heading: pair for heading, pair in _POSITIONS.items() if {*pair} <= {*names}}
     hidden_names = {*_HIDDEN_COLUMNS, *(name for pair in positions.values() for name in pair)}
     quantities = [name for name in names if name not in hidden_names and not name.startswith("failed_")]
-    selected_pair = check_shape(products.get("selected"), 2)
+    selected_pair = array_of_shape(products.get("selected"), 2)
     head = ["Pair", "Template", *([] if selected_pair is None else ["Selected"]), "Failed checks", *positions]
     head += [_HEADINGS.get(name) or label(name) for name in quantities]
     rows = []
@@ -97,13 +97,13 @@ def _format_velocities(products: Products) -> list[tuple[str, str]]:
 
 def _format_selection(products: Products) -> list[tuple[str, str]]:
     """Format the smallest differences between velocity changes of tracks and of the IMU, if the products have them."""
-    combinations = check_shape(products.get("combinations"), None, 3)
+    combinations = array_of_shape(products.get("combinations"), None, 3)
     if combinations is None or not len(combinations):
         return []
     # columns: templates of the first and of the second pair, and difference
     _, _, differences_m_s = combinations.T
     differences = [f"{number(float(value))} m/s" for value in np.sort(differences_m_s)]
-    is_selected = check_shape(products.get("selected"), 2) is not None
+    is_selected = array_of_shape(products.get("selected"), 2) is not None
     other = f"; other combinations: {differences[1]} or more" if len(differences) > 1 else ""
     text = f"{differences[0]} (selected tracks){other}" if is_selected else f"{differences[0]} or more: too large"
     return [("Velocity change between the pairs: difference from the IMU", text)]

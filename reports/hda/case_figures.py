@@ -3,11 +3,11 @@
 Colours are those of the paper's text, in shades that colour-blind readers can distinguish. Fig. 2: cameras red and
 green, features white. Fig. 3: structure pixels red, segments green, matches blue. Maps: green, yellow and red. Unknown
 parts of all maps are light blue; the paper marks them yellow in the safe landing map. A black X marks the a-priori
-site, a purple plus the reported site. The true maps in Fig. 5 and the true motion in Fig. 2 are additions. Missing
-products raise ValueError.
+site, a purple plus the reported site. The true maps in Fig. 5 and the true motion in Fig. 2 are additions. The
+functions that draw a figure raise ValueError if its products are missing; `available_figures` lists the others.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -251,31 +251,8 @@ def draw_site(products: Products) -> Figure:
     return figure
 
 
-#: For each file name, in the paper's order: function that reads the products, and function that draws the figure.
-_FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
-    "fig1-tracks": (read_tracked_features, draw_tracks),
-    "fig2-motion": (read_motion, draw_motion),
-    "fig3-epipolar": (read_matches, draw_epipolar),
-    "fig4-elevation": (read_landing_maps, draw_elevation),
-    "fig5-maps": (read_landing_maps, draw_maps),
-    "fig7-site": (read_landing_maps, draw_site),
-}
-FIGURES = {name: draw for name, (_, draw) in _FIGURES.items()}
-
-
-def available_figures(products: Products) -> list[str]:
-    """List the names of the figures whose stages a case reached."""
-    return [name for name, (read_stage, _) in _FIGURES.items() if read_stage(products) is not None]
-
-
-def _require(product: Product | None, name: str) -> Product:
-    if product is None:
-        raise ValueError(f"the products contain no {name}")
-    return product
-
-
 class _DrawnCamera(NamedTuple):
-    """A camera of the figure of the motion: its pose relative to the first camera, and its rays as `EstimatedMotion`.
+    """A camera of the figure of the motion: its rotation, translation and rays are those of `EstimatedMotion`.
 
     line: style of the outline; a camera with a dotted outline has no rays and axes in the figure
     """
@@ -376,3 +353,34 @@ def _value_at_cell(values: Float[np.ndarray, "rows columns k"], cell: Float[np.n
     if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
         return None
     return values[row, column] if np.isfinite(values[row, column]).all() else None
+
+
+def _require(product: Product | None, name: str) -> Product:
+    if product is None:
+        raise ValueError(f"the products contain no {name}")
+    return product
+
+
+class _PaperFigure(NamedTuple):
+    """Function that draws a figure, and readers of all products that it needs; they return None for a missing one."""
+
+    draw: Callable[[Products], Figure]
+    readers: Sequence[Callable[[Products], object]]
+
+
+#: Figures by file name, in the paper's order.
+_FIGURES: Mapping[str, _PaperFigure] = {
+    "fig1-tracks": _PaperFigure(draw_tracks, (read_images, read_tracked_features)),
+    "fig2-motion": _PaperFigure(draw_motion, (read_motion,)),
+    "fig3-epipolar": _PaperFigure(draw_epipolar, (read_images, read_matches)),
+    "fig4-elevation": _PaperFigure(draw_elevation, (read_landing_maps,)),
+    "fig5-maps": _PaperFigure(draw_maps, (read_landing_maps, read_ground_truth)),
+    "fig7-site": _PaperFigure(draw_site, (read_images, read_landing_maps)),
+}
+#: Functions that draw the figures, by file name.
+FIGURES = {name: figure.draw for name, figure in _FIGURES.items()}
+
+
+def available_figures(products: Products) -> list[str]:
+    """List the names of the figures whose products a case contains: these figures can be drawn."""
+    return [name for name, figure in _FIGURES.items() if all(read(products) is not None for read in figure.readers)]

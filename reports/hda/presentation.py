@@ -28,6 +28,7 @@ from marsyard.reports.images import draw_images
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products
 from marsyard.reports.wording import note_text, number
+from marsyard.scenarios.landing.parameters import LanderParameters
 
 _CAPTIONS: Mapping[str, str] = {
     "fig1-tracks": "Fig. 1: features of the first image and their tracks in the second image.",
@@ -100,14 +101,18 @@ def _stage_rows(products: Products) -> tuple[list[str], list[TableRow]]:
 
 
 def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
-    """Return the cause of an unsafe site or touchdown, or the number of tracks of a flight without a map."""
+    """Return the cause of an unsafe site or touchdown, or the number of tracks of a flight without a map.
+
+    A site is unsafe beyond the lander's limits. Those of the algorithm (columns `max_slope_deg` and `max_roughness_m`)
+    can differ from them.
+    """
     place = metric.removesuffix("_safe")
     if place in ("site", "touchdown"):
         slope_deg, roughness_m = (to_float(row.get(f"{place}_{name}")) for name in ("slope_deg", "roughness_m"))
         if math.isnan(slope_deg + roughness_m):
             return None
-        slope_ratio = slope_deg / to_float(row.get("max_slope_deg"))
-        roughness_ratio = roughness_m / to_float(row.get("max_roughness_m"))
+        slope_ratio = slope_deg / _lander_limit(row, "max_slope_deg")
+        roughness_ratio = roughness_m / _lander_limit(row, "max_roughness_m")
         detail = f"ground with a slope of {number(slope_deg)} deg and a roughness of {number(roughness_m)} m"
         if place == "touchdown" and not math.isnan(distance_m := to_float(row.get("touchdown_error_m"))):
             detail += f", {number(distance_m)} m from the site"
@@ -117,6 +122,12 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
             "few tracks", f"{to_float(row.get('tracks')):.0f} of {to_float(row.get('features')):.0f} features tracked"
         )
     return None
+
+
+def _lander_limit(row: Mapping[str, Any], name: str) -> float:
+    """Return a limit of the lander: the sampled value or that of the campaign's file, otherwise the default."""
+    limit = to_float(row.get(f"lander.{name}"))
+    return float(getattr(LanderParameters(), name)) if math.isnan(limit) else limit
 
 
 HDA = Presentation(

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.reports.products import check_shape, numeric_product, read_arrays, to_matrix
+from marsyard.reports.products import array_of_shape, numeric_product, read_arrays, to_matrix
 
 MapArray = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
@@ -25,10 +25,12 @@ class TrackedFeatures:
 
 @dataclass(frozen=True)
 class EstimatedMotion:
-    """Pose of the second camera relative to the first, and structure in the first camera's frame, metres.
+    """Motion `second_from_first` of the camera, and structure in the first camera's frame, metres.
 
-    points: positions of the accepted tracks
-    corner_rays: rays of each image's corners in its camera's frame, with depth 1
+    - rotation, translation: the estimate; a point has the coordinates x_second = rotation @ x_first + translation
+    - true_rotation, true_translation: the true motion, in the same form
+    - corner_rays: rays of each image's corners in its camera's frame, with depth 1
+    - points: positions of the accepted tracks
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -124,7 +126,7 @@ def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
     names = ("rotation", "translation", "true_rotation", "true_translation", "frustum_0", "frustum_1")
     shapes = ((3, 3), (3,), (3, 3), (3,), (4, 3), (4, 3))
     arrays = read_arrays(products, dict(zip(names, shapes, strict=True)), finite=True)
-    points = check_shape(products.get("sparse_points"), None, 3)
+    points = array_of_shape(products.get("sparse_points"), None, 3)
     if arrays is None or points is None or not len(points):
         return None
     rotation, translation, true_rotation, true_translation, first_rays, second_rays = arrays
@@ -148,6 +150,14 @@ def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
     return EpipolarMatches(grid, starts, ends, matched, accepted > 0.5)
 
 
+class _Limits(NamedTuple):
+    """Values of the product `limits`: limits of the algorithm, and diameter of the lander's footprint."""
+
+    max_slope_rad: float
+    max_roughness_m: float
+    lander_diameter_m: float
+
+
 def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     """Read the maps; None if the case has no elevation map."""
     maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), ("v", "u")))
@@ -157,14 +167,14 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     if min(elevation_m.shape) < 2:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
-    frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
-    pixels, cell_m = check_shape(products.get("map_pixels"), *elevation_m.shape, 2), _read_positive(products, "cell")
+    frames = read_arrays(products, shapes | {"limits": (len(_Limits._fields),)}, finite=True)
+    pixels, cell_m = array_of_shape(products.get("map_pixels"), *elevation_m.shape, 2), _read_positive(products, "cell")
     if frames is None or pixels is None or cell_m is None:
         return None
-    corner_m, apriori, surface_from_camera, world_from_surface, limits = frames
-    if not np.all(limits > 0.0):
+    corner_m, apriori, surface_from_camera, world_from_surface, stored_limits = frames
+    limits = _Limits(*stored_limits.tolist())
+    if min(limits) <= 0.0:
         return None
-    max_slope_rad, max_roughness_m, lander_diameter_m = limits.tolist()
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
     return LandingMaps(
         elevation_m=elevation_m,
@@ -177,9 +187,9 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         apriori=apriori,
         surface_from_camera=surface_from_camera,
         world_from_surface=world_from_surface,
-        max_slope_rad=max_slope_rad,
-        max_roughness_m=max_roughness_m,
-        lander_diameter_m=lander_diameter_m,
+        max_slope_rad=limits.max_slope_rad,
+        max_roughness_m=limits.max_roughness_m,
+        lander_diameter_m=limits.lander_diameter_m,
         site=site,
     )
 
@@ -200,7 +210,7 @@ def _extrapolate_pixels(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np
 
 def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
     """Read the ground truth; None if missing."""
-    positions = check_shape(products.get("true_positions"), None, None, 2)
+    positions = array_of_shape(products.get("true_positions"), None, None, 2)
     heights = to_matrix(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
     spacing_m = _read_positive(products, "true_spacing")
@@ -210,12 +220,30 @@ def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
     maps = read_arrays(products, dict.fromkeys(names, positions.shape[:2]), finite=True)
     if maps is None:
         return None
-    camera, corner = frames
-    indices = np.nan_to_num((positions - corner)[..., ::-1] / spacing_m)
-    rows, columns = np.moveaxis(np.clip(np.rint(indices), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
-    elevation_m = heights[rows, columns] - camera[2, 3]
+    world_from_body, corner = frames
+    camera_position = world_from_body[:3, 3]
+    elevation_m = _nearest_heights(positions, heights, corner, spacing_m) - camera_position[2]
     slope_rad, roughness_m, safe, covered = maps
-    return StoredGroundTruth(positions - camera[:2, 3], elevation_m, slope_rad, roughness_m, safe > 0.5, covered > 0.5)
+    offset_from_nadir_m = positions - camera_position[:2]
+    return StoredGroundTruth(offset_from_nadir_m, elevation_m, slope_rad, roughness_m, safe > 0.5, covered > 0.5)
+
+
+def _nearest_heights(
+    positions: Float[np.ndarray, "rows columns 2"],
+    heights: Float[np.ndarray, "height_rows height_columns"],
+    corner: Float[np.ndarray, "2"],
+    spacing_m: float,
+) -> MapArray:
+    """Return the stored height nearest to each position (x, y); beyond the border, that of the nearest border cell.
+
+    The height of row i and column j is at x = corner[0] + j spacing_m and y = corner[1] + i spacing_m. An
+    unknown position (NaN) has the height of the corner.
+    """
+    # (x, y) counts columns and rows, an index is (row, column): reverse the order
+    indices = np.nan_to_num((positions - corner)[..., ::-1] / spacing_m)
+    last_index = np.array(heights.shape) - 1
+    rows, columns = np.moveaxis(np.clip(np.rint(indices), 0, last_index).astype(np.int64), -1, 0)
+    return np.asarray(heights[rows, columns])
 
 
 def _read_positive(products: Mapping[str, Any], name: str) -> float | None:

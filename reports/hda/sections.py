@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool
 
-from marsyard.reports import populations, rates
+from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, Rate, condition_blocks, flag_rate, pooled_fraction, quantile_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.effects import scatter_block
-from marsyard.reports.hda.landing_cases import PAPER, landing_rows
+from marsyard.reports.hda.landing_cases import PAPER, classify_answers, landing_rows
 from marsyard.reports.outcomes_by_size import ExtraColumn, OutcomesBySize
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Section, Subject, create_section, drop_empty_columns, has_values
@@ -75,24 +74,6 @@ def _describe_fault(fault: str, size: float) -> tuple[str, str]:
     return name, f"{size:g}" if unit == "number" else f"{size:g} {unit}"
 
 
-def classify_answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Create a mask for each outcome of the search, in the order of `ANSWERS`; each row has exactly one outcome.
-
-    `unconverged`: finished, but the algorithm reported neither a site nor that no site is safe.
-    """
-    is_reported, is_safe, is_refused = (
-        populations.flag_mask(frame, name) for name in ("site_reported", "site_safe", "no_site_reported")
-    )
-    is_finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
-    return {
-        "safe": is_reported & is_safe,
-        "wrong": is_reported & ~is_safe,
-        "refused": is_refused,
-        "unconverged": is_finished & ~is_reported & ~is_refused,
-        "unfinished": ~is_finished,
-    }
-
-
 def _median(frame: pd.DataFrame, column: str) -> float:
     return rates.quantile(rates.finite_values(frame, column), 0.5)
 
@@ -101,6 +82,7 @@ def _two_decimals(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.2f}"
 
 
+#: Outcomes in the order of the bars, of which the last has an interval. Unfinished flights count, but have no bar.
 FAULT_OUTCOMES = OutcomesBySize(
     outcomes=classify_answers,
     styles={

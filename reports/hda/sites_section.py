@@ -17,8 +17,7 @@ from marsyard.reports import populations, rates, section
 from marsyard.reports.blocks import rate_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figure_style import in_page_style
-from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, landing_rows
-from marsyard.reports.hda.sections import classify_answers
+from marsyard.reports.hda.landing_cases import ANSWERS, INTERVAL_NOTE, classify_answers, landing_rows
 from marsyard.reports.plots import RateLine, cumulative_figure, draw_rates
 from marsyard.reports.rates import CONFIDENCE, PooledRate, pooled_rate, rate_text
 from marsyard.reports.section import (
@@ -44,15 +43,6 @@ GROUNDS = {
     "narrow safe site": "only narrow safe sites exist",
     "no safe site": "no safe site exists",
 }
-#: Names of the outcomes of `classify_answers`, in the same order, with their headings; "crashed" means every case that
-#: did not finish.
-ANSWERS = {
-    "truly safe site": "safe site reported",
-    "unsafe site": "unsafe site reported",
-    "'no safe site'": "'no safe site'",
-    "not converged": "not converged",
-    "crashed": "crashed",
-}
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
@@ -77,14 +67,14 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
 
 
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
-    """Count flights by true ground (`GROUNDS`) and outcome (`ANSWERS`)."""
+    """Count flights by true ground (`GROUNDS`) and name of the outcome (`ANSWERS`)."""
     has_wide_site, has_safe_site, has_no_safe_site = (
         populations.flag_mask(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
     )
-    answer_masks = dict(zip(ANSWERS, classify_answers(frame).values(), strict=True))
+    answer_masks = classify_answers(frame)
     ground_masks = dict(zip(GROUNDS, (has_wide_site, has_safe_site & ~has_wide_site, has_no_safe_site), strict=True))
     return {
-        ground: {answer: int((ground_mask & mask).sum()) for answer, mask in answer_masks.items()}
+        ground: {answer.name: int((ground_mask & answer_masks[key]).sum()) for key, answer in ANSWERS.items()}
         for ground, ground_mask in ground_masks.items()
     }
 
@@ -93,9 +83,10 @@ def create_outcome_block(frame: pd.DataFrame) -> Block:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [
-        [GROUNDS[ground], *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()
+        [GROUNDS[ground], *(f"{answer_counts[answer.name]:,}" for answer in ANSWERS.values())]
+        for ground, answer_counts in counts.items()
     ]
-    head = ["Ground truth", *ANSWERS.values()]
+    head = ["Ground truth", *(answer.heading for answer in ANSWERS.values())]
     note = note_text("hda.outcomes")
     grid, data = Grid(head, rows), {"outcomes": counts}
     return Block(heading="Answers by ground truth", grid=grid, note=note, data=data)

@@ -25,7 +25,7 @@ from marsyard.reports.effects import scatter_block
 from marsyard.reports.figure_style import INK, MUTED, REQUIREMENT, SERIES, in_page_style
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
-from marsyard.reports.products import Products, check_shape, read_arrays, to_matrix
+from marsyard.reports.products import Products, array_of_shape, read_arrays, to_matrix
 from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import Section, Subject, create_section, has_values
 from marsyard.reports.wording import number
@@ -176,7 +176,7 @@ def draw_map(products: Products) -> Figure:
     extent = np.asarray(products["map_extent_m"], dtype=np.float64) / 1e3
     axes.imshow(products["map"], cmap="gray", origin="lower", extent=tuple(extent), interpolation="antialiased")
     true, estimated = (np.asarray(products[name], dtype=np.float64) / 1e3 for name in ("true_xy_m", "estimated_xy_m"))
-    initial = check_shape(products.get("initial_xy_m"), 2)
+    initial = array_of_shape(products.get("initial_xy_m"), 2)
     if initial is not None:
         axes.plot(*initial / 1e3, marker="X", color=SERIES[3], linestyle="none", markersize=9.0, label="initial")
     axes.plot(*true.T, color=SERIES[0], linewidth=3.0, label="true")

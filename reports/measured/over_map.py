@@ -9,7 +9,7 @@ from marsyard.reports import figure_style, section
 from marsyard.reports.column_values import numbers
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView
-from marsyard.reports.products import Products, check_shape, to_matrix
+from marsyard.reports.products import Products, array_of_shape, to_matrix
 from marsyard.reports.wording import label, note_text, number
 from marsyard.scenarios.measured.map_matching import MATCHERS
 from marsyard.scenarios.measured.over_map import RENDERED
@@ -105,7 +105,7 @@ def view(products: Products, _complete: bool = False) -> CaseView:
 def _panels(products: Products, kind: str) -> list[Panel]:
     """Create the panels of a recorded or rendered image and of the map below it; empty without the image."""
     image, map_image = to_matrix(products.get(f"{kind}_image")), to_matrix(products.get(f"{kind}_map"))
-    landmarks = check_shape(products.get(f"{kind}_landmarks"), None, 5)
+    landmarks = array_of_shape(products.get(f"{kind}_landmarks"), None, 5)
     title = f"{kind.capitalize()} image"
     if image is None:
         return []

@@ -17,7 +17,7 @@ from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image
 from marsyard.reports.measured.over_map import OVER_MAP, map_section
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Presentation, TableRow
-from marsyard.reports.products import Products, check_shape, to_matrix
+from marsyard.reports.products import Products, array_of_shape, to_matrix
 from marsyard.reports.wording import NOTHING, label, note_text, number
 from marsyard.scenarios.measured.over_map import MapOutcome
 
@@ -64,7 +64,7 @@ def read_matched_pairs(products: Products) -> list[MatchedPair]:
     pairs = []
     for image_number in _IMAGE_NUMBERS:
         # columns of the table: (u, v) in both images, offset (u, v), and 1 for inliers
-        table = check_shape(products.get(f"matches_{image_number}"), None, 7)
+        table = array_of_shape(products.get(f"matches_{image_number}"), None, 7)
         first, second = (to_matrix(products.get(f"image_{image_number + offset}")) for offset in (0, 1))
         if table is not None and first is not None and second is not None:
             pixels, offsets, inlier = np.split(table, (4, 6), axis=1)

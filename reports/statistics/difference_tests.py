@@ -4,9 +4,11 @@ Cases on one terrain are correlated. If both sets have cases on the same terrain
 terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's sum of
 hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist.
 37, 1960). If they have few terrains in common, terrains are compared instead of cases: each terrain is represented by
-the mean of the same number of its cases. Small p-values of ranks are computed by permutation. With many ties (rates of
-a few cases per terrain, for example), the rank sum is skewed. At 0.001 the p-value of its normal approximation is then
-too small by a factor of two to three.
+the mean of the same number of its cases. The means of a common terrain correlate positively. The difference of the sets
+then varies less than that of the independent means that the test assumes: the p-value is too large, not too small.
+
+Small p-values of ranks are computed by permutation. With many ties (rates of a few cases per terrain, for example), the
+rank sum is skewed. At 0.001 the p-value of its normal approximation is then too small by a factor of two to three.
 
 `marsyard.reports.statistics.paired_tests` compares two results of the same cases.
 """
@@ -72,28 +74,6 @@ class Sample:
         first_indices = np.cumsum(counts) - counts
         indices = first_indices[counts >= cases, None] + np.arange(cases)
         return np.asarray(self.values[order][indices].mean(axis=1))
-
-
-@dataclass(frozen=True)
-class Metric:
-    """One metric of a campaign: a success rate with the values 0 and 1, or an error's magnitude, for each case."""
-
-    name: str
-    is_rate: bool
-    sample: Sample
-
-    @property
-    def finite_values(self) -> Float[np.ndarray, " finite"]:
-        """Values of the cases that are not excluded."""
-        return self.sample.finite_cases().values
-
-    @property
-    def summary(self) -> float:
-        """The rate, or the median error; NaN for no cases."""
-        values = self.finite_values
-        if values.size == 0:
-            return math.nan
-        return float(values.mean() if self.is_rate else np.median(values))
 
 
 def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000) -> float:

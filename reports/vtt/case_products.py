@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from marsyard.reports.images import Image
-from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.products import Products, array_of_shape, numeric_product, to_matrix
 
 #: Valid numbers of stops.
 _STOP_NUMBERS = range(1, 1000)
@@ -116,18 +116,18 @@ def read_rover_path(products: Products) -> RoverPath | None:
     estimates = _read_positions(products.get("target_estimated_m"))
     if target is None or target.shape != (3,) or not stops.size or len({*map(len, (stops, estimates, estimated))}) > 1:
         return None
-    path, rocks = _read_positions(products.get("path_true_m")), check_shape(products.get("rocks_m"), None, 3)
+    path, rocks = _read_positions(products.get("path_true_m")), array_of_shape(products.get("rocks_m"), None, 3)
     rocks = np.empty((0, 3)) if rocks is None else rocks
     heading = np.radians(_read_or_nan(products.get("heading_deg"), len(stops)))
     return RoverPath(path if path.size else stops, stops, estimated, heading, target[:2], estimates, rocks)
 
 
 def _read_or_nan(value: object, *shape: int) -> Float[np.ndarray, "..."]:
-    values = check_shape(value, *shape)
+    values = array_of_shape(value, *shape)
     return np.full(shape, np.nan) if values is None else values
 
 
 def _read_positions(value: object) -> Float[np.ndarray, "n 2"]:
     """Read east and north of world positions; shape (0, 2) if the product is invalid."""
-    arrays = [array for width in (2, 3) if (array := check_shape(value, None, width)) is not None]
+    arrays = [array for width in (2, 3) if (array := array_of_shape(value, None, width)) is not None]
     return np.asarray(arrays[0][:, :2]) if arrays else np.empty((0, 2))

@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid, compare_campaigns, list_metrics
+from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid, compare_campaigns
 from marsyard.reports.comparison import compare_algorithms, select_algorithm
 from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
+from marsyard.reports.metrics import list_metrics
 from marsyard.reports.statistics.difference_tests import difference_p_value
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import MakeRun, make_rows

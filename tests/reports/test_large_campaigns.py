@@ -7,7 +7,7 @@ import pytest
 
 from marsyard.campaigns.studies.results import ROBUST_FOLDER
 from marsyard.reports import stored
-from marsyard.reports.campaign_diff import list_metrics
+from marsyard.reports.metrics import list_metrics
 from marsyard.reports.stored import read_run
 from marsyard.reports.variants import read_robust_studies
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows, write_run

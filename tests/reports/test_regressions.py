@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.reports.metrics import Metric
 from marsyard.reports.night_history import FINISHED, INTERRUPTED, RUNNING, History, MetricChange, NightCampaign
 from marsyard.reports.nightly import NightComparison, find_changes, format_night_page, list_comparisons
-from marsyard.reports.statistics.difference_tests import Metric, Sample
+from marsyard.reports.statistics.difference_tests import Sample
 
 N_CASES, N_TERRAINS = 100, 12
 

@@ -19,9 +19,9 @@ from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
+from marsyard.reports.images import thumbnail
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation
-from marsyard.reports.products import thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
@@ -35,7 +35,8 @@ ATTITUDE = {
     "descent_rate_m_s": 75.0,
     "horizontal_speed_m_s": 20.0,
 }
-LIMITS = {"max_slope_deg": 15.0, "max_roughness_m": 0.2}
+#: Limits of the lander, and of an algorithm with a small threshold of roughness.
+LIMITS = {"lander.max_slope_deg": 15.0, "lander.max_roughness_m": 0.2, "max_slope_deg": 15.0, "max_roughness_m": 0.05}
 TOUCHDOWN = {"touchdown_slope_deg": 6.0, "touchdown_roughness_m": 0.3, "touchdown_error_m": 1.0}
 AVAILABLE: Mapping[str, Any] = {"id": "A", "metric": "answered", "probability": 0.5, "confidence": 0.5}
 
@@ -251,3 +252,20 @@ def test_causes_follow_from_the_rows(
     cause = presentation.explain(row, metric)
     assert (None if cause is None else cause.name) == name
     assert cause is None or (isinstance(cause, Cause) and cause.detail)
+
+
+@pytest.mark.parametrize(("sampled", "name"), [({}, "slope"), ({"lander.max_slope_deg": 30.0}, "roughness")])
+def test_cause_of_an_unsafe_site_follows_from_the_lander_limits(
+    make_run: MakeRun, sampled: Mapping[str, float], name: str
+) -> None:
+    """The slope is twice the lander's limit in the file, the roughness 1.5 times; the algorithm's ratio is reversed."""
+    frame = synthetic_landing.landing_frame(100).assign(
+        site_slope_deg=16.0, site_roughness_m=0.45, max_slope_deg=20.0, max_roughness_m=0.05, **sampled
+    )
+    safe = {"id": "S", "metric": "site_safe", "probability": 0.5, "confidence": 0.5, "population": "site_reported"}
+    parameters = {"lander": {"max_slope_deg": 8.0, "max_roughness_m": 0.3}}
+    definition = {"name": "hda-threshold", "scenario": "landing", "requirements": [safe], "parameters": parameters}
+    evaluation = evaluate_run(make_run(frame, [safe], definition=definition, scenario="landing"))
+    (entry,) = CaseFinder(evaluation.run, evaluation.verdicts).requirement_cases()
+    assert entry.n_violations > 0
+    assert {row[1] for row in entry.groups.rows} == {name}

@@ -11,6 +11,7 @@ from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.case_figures import (
     BLACK,
     BLUE,
+    FIGURES,
     GREEN,
     HAZARD_COLOURS,
     PURPLE,
@@ -165,6 +166,21 @@ def test_incomplete_products_are_not_a_landing(hda_products: dict[str, Any], cha
 )
 def test_invalid_maps_are_omitted(hda_products: dict[str, Any], changes: dict[str, Any]) -> None:
     assert available_figures({**hda_products, **changes}) == ["fig1-tracks", "fig2-motion", "fig3-epipolar"]
+
+
+@pytest.mark.parametrize(
+    ("missing", "names"),
+    [
+        ("image_2", ["fig2-motion", "fig4-elevation", "fig5-maps"]),
+        ("true_heights", [name for name in FIGURES if name != "fig5-maps"]),
+    ],
+)
+def test_only_figures_whose_products_are_complete_are_available(
+    hda_products: dict[str, Any], missing: str, names: list[str]
+) -> None:
+    products = {name: value for name, value in hda_products.items() if name != missing}
+    assert available_figures(products) == names
+    assert all(FIGURES[name](products).axes for name in names)
 
 
 def test_maps_with_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None:
