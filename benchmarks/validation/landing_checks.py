@@ -7,8 +7,10 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
+from marsyard.campaigns.definition.parameter_paths import replace_values
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.cameras import camera_optics
+from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
@@ -55,10 +57,9 @@ def make_noise_free_detector(camera: str) -> DetectorParameters:
 
 def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
     """Draw parameters of an image pair as in `hda-map`, with attitudes of a helicopter and without errors."""
-    no_errors = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "rotation_deg": 0.0}
     east, north = rng.uniform(0.0, 102.4, 2)
     roll, pitch, yaw = rng.normal(0.0, 2.0, 3)
-    return LandingScenarioParameters.model_validate(
+    parameters = LandingScenarioParameters.model_validate(
         {
             "site": site,
             "terrain": {"samples": 2048},
@@ -75,10 +76,13 @@ def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenari
                 "pitch_deg": pitch,
                 "yaw_deg": yaw,
             },
-            "navigation": {**no_errors, "inclinometer_deg": 0.0},
-            "laser": LaserParameters(noise_m=0.0, count_m=0.0).model_dump(),
+            "laser": LaserParameters(count_m=0.0).model_dump(),
         }
-    )
+    ).model_dump()
+    # also those sources of error that instruments may get later
+    for source in error_sources("landing"):
+        parameters = replace_values(parameters, source.exact_values(parameters))
+    return LandingScenarioParameters.model_validate(parameters)
 
 
 def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
