@@ -20,17 +20,17 @@ from marsyard.reports.wording import count, format_fraction
 class TerrainSupply:
     """Number of terrains that the cases of a campaign can use.
 
-    - table_name: table of the parameters `bank` and `terrain`: `location` or `world`
+    - table_name: table of the parameters `bank` and `terrain`: `location` or `world`; empty in reports that lack it
     - key: parameter that sets this number: size of the terrain bank, or range of the dispersed terrain number
     - is_bank_size: whether this parameter is the size of the terrain bank
     - in_turn: whether the cases use the terrains in turn; otherwise terrains are drawn at random with replacement
     """
 
     terrains: int
-    table_name: str
     key: str
     is_bank_size: bool = False
     in_turn: bool = False
+    table_name: str = ""
 
     def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs at least `min_terrains` terrains, not more cases; state the options."""
@@ -62,12 +62,14 @@ def read_terrain_supply(definition: Mapping[str, Any]) -> TerrainSupply | None:
         path = f"{table_name}.terrain"
         dispersion = table(dispersions.get(path))
         if not dispersion:
-            return TerrainSupply(1, table_name, path)
+            return TerrainSupply(1, path, table_name=table_name)
         in_turn = dispersion.get("distribution") == "in-turn"
         low, high = dispersion.get("low"), dispersion.get("high")
         if isinstance(low, int) and isinstance(high, int):  # otherwise a formula of the bank's size
-            return TerrainSupply(min(high - low + 1, bank), table_name, f'dispersions."{path}"', in_turn=in_turn)
-        return TerrainSupply(bank, table_name, f"{table_name}.bank", is_bank_size=True, in_turn=in_turn)
+            key = f'dispersions."{path}"'
+            return TerrainSupply(min(high - low + 1, bank), key, in_turn=in_turn, table_name=table_name)
+        key = f"{table_name}.bank"
+        return TerrainSupply(bank, key, is_bank_size=True, in_turn=in_turn, table_name=table_name)
     return None
 
 

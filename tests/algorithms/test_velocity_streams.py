@@ -209,7 +209,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
         np.testing.assert_array_equal(getattr(restored_frame, name), getattr(frame, name))
     assert repr(restored_frame.altitude) == repr(frame.altitude)
-    assert restored_frame.gravity_m_s2 == frame.gravity_m_s2 == 3.71
+    assert restored_frame.gravity_m_s2 == frame.gravity_m_s2 == 3.72
     assert (restored_frame.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "image.json"
     path.write_text(path.read_text().replace('"exchange": 3', '"exchange": 2'))
