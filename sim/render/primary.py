@@ -17,7 +17,7 @@ from jaxtyping import Int32 as IntArray
 
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, where
 from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
-from marsyard.sim.render.ground import MAX_CHANGE, Extent, refine, search_grazing_ray
+from marsyard.sim.render.ground import MAX_CHANGE, Extent, clearance_at, first_crossing, refine, search_grazing_ray
 from marsyard.sim.render.pixel_rays import PixelRays
 from marsyard.sim.render.rays import Pose, Ray, Rays
 from marsyard.sim.render.spline import Terrain
@@ -110,12 +110,10 @@ class _Guess:
     """What the views show around a ray.
 
     - t: first guess of the distance to the ground, metres; 0 if no sample shows ground
-    - footprint: length of the pixel on the ground, metres
     - numbers: triangle numbers (from 1) of the four samples; None without triangles
     """
 
     t: Values
-    footprint: Values
     numbers: list[Values] | None
 
 
@@ -150,9 +148,7 @@ def _guess(views: Views, rays: Rays, ray: Ray) -> _Guess:
         if numbers is not None:
             is_nearer &= numbers[k] == 0
         nearest, min_offset = dr.select(is_nearer, depths[k], nearest), dr.select(is_nearer, offset, min_offset)
-    t = Float64(dr.select(is_continuous & ~shows_triangle, interpolated, nearest)) / z
-    footprint = Float(t) * rays.pixel_angles / larger(Float(-ray.direction.z), MIN_INCIDENCE_SINE)
-    return _Guess(t, footprint, numbers)
+    return _Guess(Float64(dr.select(is_continuous & ~shows_triangle, interpolated, nearest)) / z, numbers)
 
 
 def _hit_object(numbers: list[Values], tree: Hierarchy, ray: Ray, farthest: Values) -> TriangleHit:
@@ -179,6 +175,20 @@ def _hit_object(numbers: list[Values], tree: Hierarchy, ray: Ray, farthest: Valu
     return where(is_missed, lambda: nearest_hit(tree, ray, farthest, is_missed), best)
 
 
+def _level_at(terrain: Terrain, rays: Rays, ray: Ray, t: Values) -> Values:
+    """Return the terrain level for ground at a distance: coarse if a pixel covers many samples of the finest level."""
+    footprint = Float(t) * rays.pixel_angles / larger(Float(-ray.direction.z), MIN_INCIDENCE_SINE)
+    samples = footprint / (MAX_FINE_FOOTPRINT * Float(terrain.spacing))
+    return dr.select(samples > 1.0, dr.minimum(Int32(dr.log2(samples)) + 1, terrain.top_level), 0)
+
+
+def _cover_buried(terrain: Terrain, level: Values, ray: Ray, hit: TriangleHit) -> TriangleHit:
+    """Replace hits of objects below the ground by those of the ground in front of them."""
+    is_buried = clearance_at(terrain, level, ray, hit.t, Bool(True)).height < 0.0
+    t = first_crossing(terrain, level, ray, (1.0 - MAX_CHANGE) * hit.t, hit.t, is_buried)
+    return dr.select(is_buried & (t < hit.t), no_hit(t), hit)
+
+
 @compiled
 def trace_primary_rays(
     terrain: Terrain, extent: Extent, views: Views, pose: Pose, rays: Rays, tree: Hierarchy | None, is_grazing: bool
@@ -190,10 +200,7 @@ def trace_primary_rays(
     ray = rays.in_world(pose)
     guess = _guess(views, rays, ray)
     is_ground = guess.t > 0.0
-    # a coarser level if the pixel's footprint covers many samples
-    samples = guess.footprint / (MAX_FINE_FOOTPRINT * Float(terrain.spacing))
-    level = dr.select(samples > 1.0, dr.minimum(Int32(dr.log2(samples)) + 1, terrain.top_level), 0)
-    level = dr.select(is_ground, level, 0)
+    level = dr.select(is_ground, _level_at(terrain, rays, ray, guess.t), 0)
     t = Float64(dr.inf)
     if is_grazing:
         is_searched = is_ground & (ray.direction.z > -MAX_GRAZING_SINE)
@@ -205,6 +212,10 @@ def trace_primary_rays(
     if tree is not None and guess.numbers is not None:
         object_hit = _hit_object(guess.numbers, tree, ray, hit.t)
         hit = dr.select((object_hit.number >= 0) & (object_hit.t < hit.t), object_hit, hit)
+        # the mesh is not exact: at the foot of a body, it may be below the body where the ground is above it
+        is_object, foot_level = hit.number >= 0, _level_at(terrain, rays, ray, hit.t)
+        hit = where(is_object, lambda: _cover_buried(terrain, foot_level, ray, hit), hit)
+        level = dr.select(is_object & (hit.number < 0), foot_level, level)
     is_on_mesh = (level == 0) & has_failed
     return Hits.of(hit, dr.select(is_on_mesh, -1, level))
 

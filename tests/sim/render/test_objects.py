@@ -7,10 +7,12 @@ import pytest
 import trimesh
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
-from marsyard.sim.frames import direction
-from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, PixelRays, Renderer, Scene, Sun, process_renderer
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.device import Float64
@@ -19,6 +21,7 @@ from marsyard.sim.render.pinhole import depth_in_metres
 from marsyard.sim.render.shadows import Footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, Surface, TerrainParameters, site
+from tests.sim.scenes import LAMBERT, make_ground
 
 #: Number of triangles of each body.
 COUNTS = (5, 1, 80, 3)
@@ -217,6 +220,25 @@ def test_culling_does_not_change_images(elevation: float) -> None:
         # Culling keeps the spheres of the remaining objects.
         new_objects = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
         np.testing.assert_array_equal(visible_scene.objects.spheres, new_objects.spheres)
+
+
+def test_no_part_of_a_body_below_the_ground_is_visible(renderer: Renderer) -> None:
+    """The mesh of the ground is too coarse for the ripples in front of a buried sphere."""
+    ripples = 0.03 * np.sin(2.0 * np.pi * np.arange(256) * 0.05 / 0.4)
+    surface = make_ground(np.broadcast_to(ripples, (256, 256)), 0.05)
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.6)
+    sphere.apply_translation([6.4, 6.4, -0.35])
+    faces = sphere.faces.astype(np.int32)
+    names = np.zeros(len(faces), dtype=np.int32)
+    body = Objects.of_mesh(np.array(sphere.vertices), np.array(sphere.vertex_normals), faces, names, albedo=0.2)
+    scene = Scene(
+        surface, (6.4, 6.4), Sun(direction(0.5, 0.8)), LAMBERT, body, mesh_finest_m=0.3, mesh_half_width_m=100.0
+    )
+    camera = Cahv.from_field_of_view(np.radians(25.0), (256, 256), axis=(1.0, 0.0, -0.35), right=(0.0, -1.0, 0.0))
+    frame = renderer.render(scene, PixelRays.from_camera(camera), rigid(Rotation.identity(), np.array([3.0, 6.4, 1.2])))
+    x, y, z = frame.points_world()[frame.body >= 0].T
+    assert len(x) > 2000
+    assert np.min(z - surface.height(x, y)) > -1e-4
 
 
 def test_perspective_depths_convert_to_metres() -> None:
