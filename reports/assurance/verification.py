@@ -153,6 +153,12 @@ def _verify_run(run: AssuredRun, evaluation: Evaluation, record: Path, is_same_p
     # the chain of the rows begins with the hash of the definition
     if run.identity != stored_definition_hash(run.definition):
         yield f"{run.folder}/campaign.json: the definition is not the one with which the rows were stored"
+    for key in ("name", "seed"):
+        value, defined = run.record.get(key), run.definition.get(key)
+        if value != defined:
+            yield f"{run.folder}/campaign.json: {key} is {value!r}, {defined!r} in the definition"
+    if run.record.get("cases_finished") != len(evaluation.run.all_cases):
+        yield f"{run.folder}/campaign.json: cases_finished is not the number of rows"
     if evidence.is_confirmation and evidence.record:
         entry = find_own_entry(read_record(record), evidence)
         if entry is None:

@@ -135,6 +135,8 @@ def test_package_verifies(package: Path) -> None:
         (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
         (change_validation_row, "index.html: the content does not follow"),
+        (edit_json("campaign.json", lambda record: record.update(seed=8)), f"{RUN}/campaign.json: seed is 8, "),
+        (edit_json("campaign.json", lambda record: record.update(cases_finished=8)), f"{RUN}/campaign.json: cases_fin"),
         (
             edit_json("campaign.json", lambda record: record["definition"].update(seed=8)),
             f"{RUN}/campaign.json: the definition is not the one with which the rows were stored",
