@@ -35,6 +35,8 @@ REASONS_FOR_WIDE_LIMITS = {
     "change to FAIL": "the guaranteed accuracy; the standard deviation of the estimate is 2 to 3 %",
     "nights with a false alarm": "the guaranteed rate",
     "kurtosis_8, descent over meridiani divided by gusev": "a factor of two in both directions",
+    "second peak divided by first peak: minimum": "rendered images must cover the range of flight images",
+    "bias of motion, rock at": "a mean over the patches of one rock can be near 0 by chance",
     "refused templates": "the 95 % confidence interval of 1 in 4 templates of flight images",
 }
 
