@@ -22,8 +22,9 @@ from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.terrain import RockField, RockParameters, Surface, TerrainParameters, sites, synthesise
 
 #: Maximum RMS differences of the hidden fractions of the sky and of the aureole: wheels, legs, mast and arm are not
-#: part of a rover's shelter, and rocks are no half spheroids. About twice the measured values.
-LIMITS = {("sky", "a rover"): 0.1, ("sky", "rocks"): 0.06, ("aureole", "a rover"): 0.2, ("aureole", "rocks"): 0.2}
+#: part of a rover's shelter, and rocks are no half spheroids. Between 1.1 times (rover) and twice (rocks) the measured
+#: values.
+LIMITS = {("sky", "a rover"): 0.1, ("sky", "rocks"): 0.06, ("aureole", "a rover"): 0.2, ("aureole", "rocks"): 0.16}
 #: Side of the level ground, metres, and half width of the compared area around its middle.
 SIDE_M, HALF_WIDTH_M = 64, 1.5
 #: Sites whose relief hides a part of the sky.
