@@ -22,7 +22,7 @@ from scipy import stats
 
 from benchmarks import hda
 from benchmarks.engine import measure_table_s
-from benchmarks.estimators import record_descents
+from benchmarks.estimators import simulate_descents
 from benchmarks.images import prepare_descent_exposure
 from benchmarks.timing import elapsed_seconds
 from benchmarks.vtt import prepare_update
@@ -42,7 +42,7 @@ FALSE_ALARM_RATE = 0.01
 
 def _prepare_dimes() -> Callable[[], object]:
     """Return a function that runs DIMES on a rendered descent."""
-    measurements, estimator = record_descents("dimes-smoke", 1)[0].measurements, DimesEstimator()
+    measurements, estimator = simulate_descents("dimes-smoke", 1)[0].measurements, DimesEstimator()
     return lambda: estimator.estimate(measurements)
 
 

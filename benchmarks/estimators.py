@@ -3,15 +3,17 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from benchmarks.timing import Measurement
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
-from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
+from marsyard.algorithms.interface import VelocityEstimator
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.descent import simulation
+from marsyard.scenarios.descent.overlap import overlap_row
+from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.sim.measurements import DescentMeasurements
 
 #: Compared estimators, by name.
@@ -25,17 +27,6 @@ ESTIMATORS: Mapping[str, VelocityEstimator] = {
 REPEATS = 3
 
 
-class Recorder:
-    """Estimator that records its measurements for other estimators."""
-
-    measurements_of_runs: ClassVar[list[DescentMeasurements]] = []
-
-    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Record the measurements without an answer."""
-        self.measurements_of_runs.append(measurements)
-        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
-
-
 @dataclass(frozen=True)
 class Descent:
     """Measurements of a descent, true mean velocity over the second image pair, and whether the overlap is feasible."""
@@ -45,15 +36,16 @@ class Descent:
     has_feasible_overlap: bool
 
 
-def record_descents(campaign_name: str, cases: int) -> list[Descent]:
-    """Run the first cases of a descent campaign and record their measurements."""
-    campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
+def simulate_descents(campaign_name: str, cases: int) -> list[Descent]:
+    """Simulate the first cases of a descent campaign without an estimator."""
+    campaign = load_campaign(campaign_name)
     descents = []
     for case in range(cases):
-        Recorder.measurements_of_runs.clear()
-        row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
-        velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        descents.append(Descent(Recorder.measurements_of_runs[0], velocity, bool(row["feasible_overlap"])))
+        p = DescentScenario().check_parameters(campaign.parameters(case))
+        descent = simulation.Descent.simulate(p, campaign.streams(case))
+        velocity = np.array(descent.truth(descent.measurements.last_interval_s))
+        is_feasible = bool(overlap_row(p, descent.world, descent.states)["feasible_overlap"])
+        descents.append(Descent(descent.measurements, velocity, is_feasible))
     return descents
 
 
@@ -87,7 +79,7 @@ def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Esti
 
 def compare_estimators(cases: int) -> list[Measurement]:
     """Measure the core-seconds of each estimator on the same descents of three images, binned to 256 x 256."""
-    descents = record_descents("dimes-smoke", cases)
+    descents = simulate_descents("dimes-smoke", cases)
     limits_s = {"DIMES": 0.015}
     return [
         Measurement(

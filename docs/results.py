@@ -35,8 +35,8 @@ ROOT = Path(__file__).parents[1]
 STORED = ROOT / "benchmarks" / "results" / "reports"
 HASHES = "rows.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
-#: Folders whose sources determine the rows and verdicts of a run.
-SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
+#: Sources that determine the rows and verdicts of a run, as patterns of git.
+SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports", ":(exclude)reports/validation.json")
 _BLOCK = re.compile(r"(<!-- (results|comparison): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.,-])\d[\d,]*(?:\.\d+)?(?![\w-])")
 Reports = Mapping[str, CampaignReport]

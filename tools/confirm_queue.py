@@ -3,8 +3,9 @@
 A line of the list contains a campaign, its number of cases and of worker processes; ``#`` begins a comment. The record
 of confirmations is committed after each campaign. A repeated call skips complete campaigns, resumes interrupted ones,
 and repeats those without a folder with the seeds of their entry in the record. All campaigns run on one source tree:
-the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Exit code: 0
-if all campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
+the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Pages of the
+documentation and stored measurements are no part of the tree, because they determine neither rows nor verdicts. Exit
+code: 0 if all campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
 """
 
 import argparse
@@ -15,6 +16,9 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
+
+#: Patterns of git for the files that determine neither rows nor verdicts.
+_NO_SOURCES = (":(exclude)*.md", ":(exclude)docs", ":(exclude)benchmarks/results", ":(exclude)reports/validation.json")
 
 
 class Entry(NamedTuple):
@@ -49,8 +53,8 @@ def git(*arguments: str) -> str:
 
 
 def hash_tree(record: Path, log: Path) -> str:
-    """Hash all committed files except the record; raises ValueError if files have changes, or the log another hash."""
-    files = ("--", ":/", f":(exclude){record}")
+    """Hash the committed sources; raises ValueError if one of them has changes, or if the log contains another hash."""
+    files = ("--", ":/", *_NO_SOURCES, f":(exclude){record}")
     changed = git("status", "--porcelain", "--untracked-files=no", *files).split("\n")[0]
     if changed:
         raise ValueError(f"the tree has changes ({changed.strip()}): commit them before a confirmation")

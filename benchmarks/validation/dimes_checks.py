@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_TRACK_ERRORS_M_S
-from benchmarks.estimators import ESTIMATORS, record_descents, run_estimator
+from benchmarks.estimators import ESTIMATORS, run_estimator, simulate_descents
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Check, Measure
@@ -79,7 +79,7 @@ def _read_stored_median_m_s() -> float:
 
 def compare_estimators(quick: bool) -> Iterator[Measure]:
     """Measure the velocity errors of all estimators on the same descents."""
-    descents = record_descents("dimes-smoke", 4 if quick else 48)
+    descents = simulate_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)
         valid = results.valid_errors_m_s

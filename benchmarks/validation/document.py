@@ -6,9 +6,11 @@ The packaged rows (`marsyard.reports.validation_rows`) also contain the conditio
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,11 @@ ROOT = Path(__file__).parents[2]
 TEMPLATE = Path(__file__).parent / "template.md"
 DOCUMENT = ROOT / "docs" / "validation.md"
 RESULTS = ROOT / "benchmarks" / "results" / "validation.json"
+#: Sources of the measurements, as patterns of git.
+_SOURCES = (
+    *("sim", "algorithms", "scenarios", "campaigns", "reports", "benchmarks/validation"),
+    ":(exclude)reports/validation.json",
+)
 #: Packages whose versions a measurement can depend on.
 PACKAGES = ("marsyard", "numpy", "scipy", "numba", "pyrender2", "trimesh")
 
@@ -63,13 +70,22 @@ def store(results: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
 
 
 def _read_environment(quick: bool) -> dict[str, str]:
-    """Return machine, OpenGL library, package versions and number of samples of the measurements."""
+    """Return sources, machine, OpenGL library, package versions and number of samples of the measurements."""
     return {
+        "sources": _describe_sources(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {processor_features()}",
         "gl": renderer().description(),
         "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         "samples": "few (--quick)" if quick else "all",
     }
+
+
+def _describe_sources() -> str:
+    """Return the last commit that changed a source of the measurements, and whether there are uncommitted changes."""
+    git = partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True)
+    commit = git(["git", "log", "-1", "--format=%h", "--abbrev=8", "--", *_SOURCES]).stdout.strip()
+    changed = git(["git", "status", "--porcelain", "-uno", "--", *_SOURCES]).stdout
+    return f"commit {commit}{' with changes' * bool(changed)}"
 
 
 def read_stored() -> dict[str, dict]:
@@ -155,12 +171,12 @@ def _describe_environments(checks: Sequence[Check], stored: dict[str, dict]) -> 
     environments = {check.name: stored[check.name]["environment"] for check in checks if check.name in stored}
     if not environments:
         return "Nothing has been measured yet."
-    labels = {"machine": "", "gl": "OpenGL ", "versions": "", "samples": "samples: "}
+    labels = {"sources": "", "machine": "", "gl": "OpenGL ", "versions": "", "samples": "samples: "}
     common_values, exceptions = [], []
     for key, label in labels.items():
         groups: dict[str, list[str]] = {}
         for name, environment in environments.items():
-            groups.setdefault(environment[key], []).append(name)
+            groups.setdefault(environment.get(key, f"{key} unknown"), []).append(name)
         common_value = max(groups, key=lambda value: len(groups[value]))
         common_values.append(f"{label}{common_value}")
         exceptions += [

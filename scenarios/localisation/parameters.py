@@ -105,6 +105,10 @@ class ImageSchedule(Parameters):
         return np.asarray(times[times <= end_s])
 
 
+#: Faults of instruments, which `exact_instruments` removes.
+_INSTRUMENT_FAULTS = ("altitude_error", "attitude_error_deg")
+
+
 class LocalisationFaults(SizedFaults):
     """Faults of a descent with localisation."""
 
@@ -192,6 +196,9 @@ class LocalisationScenarioParameters(AlgorithmSelection):
             raise ValueError(
                 "faults.wrong_map needs another terrain; all terrains with terrain.source contain the same DTM"
             )
+        ineffective = [name for name in _INSTRUMENT_FAULTS if self.exact_instruments and getattr(self.faults, name)]
+        if ineffective:
+            raise ValueError(f"faults.{ineffective[0]} has no effect with exact_instruments; allowed: 0")
         instruments.check_clock("clock", self.clock)
         instruments.check_clock("altimeter.clock", self.altimeter.clock)
         if self.faults.wrong_map and self.location.bank < 2:

@@ -177,6 +177,13 @@ def test_wrong_map_needs_another_terrain() -> None:
         _make_parameters(faults={"wrong_map": 1}, location={"bank": 1})
 
 
+@pytest.mark.parametrize("fault", ["altitude_error", "attitude_error_deg"])
+def test_exact_instruments_have_no_faults(fault: str) -> None:
+    with pytest.raises(ValidationError, match=rf"faults.{fault} has no effect with exact_instruments; allowed: 0"):
+        _make_parameters(faults={fault: 0.5}, exact_instruments=True)
+    _make_parameters(faults={fault: 0.5})
+
+
 def test_attitude_error_tilts_the_initial_attitude() -> None:
     """The fault is an additional rotation about a horizontal axis; the drawn initial errors are the same."""
     clean, tilted = (descent.measurements.initial for descent in (_simulate(), _simulate(attitude_error_deg=2.0)))
