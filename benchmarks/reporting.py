@@ -20,8 +20,10 @@ import pyarrow.parquet as pq
 from playwright.sync_api import Page, expect, sync_playwright
 
 from benchmarks.timing import Measurement
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.definition.requirements import shipped_requirements
-from marsyard.campaigns.store.record import SCHEMA
+from marsyard.campaigns.store.record import update, write_first_record
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.signature import sign_report
 
@@ -96,7 +98,7 @@ def synthetic_campaign(directory: Path, cases: int, seed: int = 1, site: str = "
         writer.write_table(block)
     if writer is not None:
         writer.close()
-    (directory / "campaign.json").write_text(json.dumps(_make_record(cases, seed, site)), encoding="utf-8")
+    _write_record(directory, cases, seed, site)
     return directory
 
 
@@ -147,22 +149,21 @@ def _draw_rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
     return pa.table(columns)
 
 
-def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
-    """Return the content of `campaign.json`; dates and commits differ between seeds."""
-    requirements = [shipped_requirements()[name].model_dump(mode="json") for name in ("DIMES-VEL", "DIMES-HARM")]
-    definition = {"name": f"dimes-{site}", "scenario": "descent", "cases": cases, "seed": seed}
-    return {
-        "schema": SCHEMA,
-        "name": f"dimes-{site}",
-        "state": "finished",
-        "started_utc": f"2026-{1 + seed // 28 % 12:02}-{1 + seed % 28:02}T00:00:00Z",
-        "finished_utc": "2026-12-31T00:00:00Z",
-        "cases": cases,
-        "seed": seed,
-        "requirements": requirements,
-        "definition": {**definition, "parameters": {"site": site}, "requirements": requirements},
-        "git_commit": f"{seed % 7:040x}",
-    }
+def _write_record(directory: Path, cases: int, seed: int, site: str) -> None:
+    """Write `campaign.json` of a finished campaign; dates and commits differ between seeds."""
+    requirements = tuple(shipped_requirements()[name].to_table() for name in ("DIMES-VEL", "DIMES-HARM"))
+    definition = CampaignDefinition(
+        name=f"dimes-{site}",
+        scenario="descent",
+        cases=cases,
+        seed=seed,
+        parameters={"site": site},
+        requirements=requirements,
+    )
+    write_first_record(directory, definition, Identity("", "", {}, {}), "none", origin={})
+    started = f"2026-{1 + seed // 28 % 12:02}-{1 + seed % 28:02}T00:00:00Z"
+    finished = {"state": "finished", "cases_finished": cases, "finished_utc": "2026-12-31T00:00:00Z"}
+    update(directory, {**finished, "started_utc": started, "git_commit": f"{seed % 7:040x}"})
 
 
 def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
@@ -174,12 +175,11 @@ def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
         run = folder / "runs" / f"run-{number:04}"
         shutil.copytree(original_run, run, copy_function=os.link)
         site = ("gusev", "meridiani", "isidis")[number % 3]
-        for name, content in (
-            ("campaign.json", _make_record(24, number, site)),
-            ("report.json", _rename_report(original_run, site)),
-        ):
+        # new files, because those of the original run are hard links
+        for name in ("campaign.json", "report.json"):
             (run / name).unlink()
-            (run / name).write_text(json.dumps(content), encoding="utf-8")
+        _write_record(run, 24, number, site)
+        (run / "report.json").write_text(json.dumps(_rename_report(original_run, site)), encoding="utf-8")
         sign_report(run, run)
     return folder / "site"
 

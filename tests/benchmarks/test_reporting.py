@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import reporting
+from marsyard.reports.dashboard.site import write_site
 
 
 def test_rows_of_rendered_cases_are_multiplied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,3 +25,10 @@ def test_rows_of_rendered_cases_are_multiplied(tmp_path: Path, monkeypatch: pyte
     assert rows["error_m"].nunique() == 300
     assert rows["answered"].all()
     assert json.loads((folder / "campaign.json").read_text())["cases"] == 300
+
+
+def test_synthetic_campaigns_have_reports_and_a_dashboard(tmp_path: Path) -> None:
+    run = reporting.synthetic_campaign(tmp_path / "of-24", 24)
+    assert reporting.write_report(run).exists()
+    site = write_site(reporting._copy_campaigns(tmp_path / "many", run, 3), [tmp_path / "many" / "runs"])
+    assert (site.campaigns, site.problems) == (3, [])
