@@ -3,9 +3,9 @@
 A line of the list contains a campaign, its number of cases and of worker processes; ``#`` begins a comment. The record
 of confirmations is committed after each campaign. A repeated call skips complete campaigns, resumes interrupted ones,
 and repeats those without a folder with the seeds of their entry in the record. All campaigns run on one source tree:
-the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Pages of the
-documentation and stored measurements are no part of the tree, because they determine neither rows nor verdicts. Exit
-code: 0 if all campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
+the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Pages, tests,
+tools and measurements are no part of the tree, because they determine neither rows nor verdicts. Exit code: 0 if all
+campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
 """
 
 import argparse
@@ -18,7 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 #: Patterns of git for the files that determine neither rows nor verdicts.
-_NO_SOURCES = (":(exclude)*.md", ":(exclude)docs", ":(exclude)benchmarks/results", ":(exclude)reports/validation.json")
+_NO_SOURCES = tuple(
+    f":(exclude){path}" for path in ("*.md", "docs", "benchmarks", "tests", "tools", "reports/validation.json")
+)
 
 
 class Entry(NamedTuple):

@@ -67,7 +67,8 @@ def test_workflow_runs_the_command_of_the_checks() -> None:
 
 def test_release_notes_are_a_section_of_the_changelog() -> None:
     script = ROOT / "tools" / "release_notes.sh"
-    result = subprocess.run([script, "Unreleased"], capture_output=True, text=True, check=True)
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    result = subprocess.run([script, version], capture_output=True, text=True, check=True)
     assert "### Added" in result.stdout
     assert "## [" not in result.stdout
     unknown = subprocess.run([script, "0.0.0"], capture_output=True, text=True, check=False)
