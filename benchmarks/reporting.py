@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from playwright.sync_api import Page, expect, sync_playwright
 
 from benchmarks.timing import Measurement
-from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import update, write_first_record
@@ -151,7 +151,8 @@ def _draw_rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
 
 def _write_record(directory: Path, cases: int, seed: int, site: str) -> None:
     """Write `campaign.json` of a finished campaign; dates and commits differ between seeds."""
-    requirements = tuple(shipped_requirements()[name].to_table() for name in ("DIMES-VEL", "DIMES-HARM"))
+    names, shared = ("DIMES-VEL", "DIMES-HARM"), shipped_requirements()
+    requirements = tuple(Requirement.model_validate(shared[name].to_table()) for name in names)
     definition = CampaignDefinition(
         name=f"dimes-{site}",
         scenario="descent",
