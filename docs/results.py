@@ -1,10 +1,12 @@
 """Tables of results in README and pages, from the stored `report.json` of runs: ``python docs/results.py [RUN...]``.
 
-A run folder is stored as `benchmarks/results/reports/CAMPAIGN.json` (with ``NAME=FOLDER`` under another name), and the
-hash of its rows in `rows.sha256`. The tables are written between two comments:
+A run folder is stored as `benchmarks/results/reports/CAMPAIGN.json` (with ``NAME=FOLDER`` under another name), the
+tables of its report's sections in `sections/CAMPAIGN.json`, and the hash of its rows in `rows.sha256`. The tables are
+written between two comments:
 
     <!-- results: CAMPAIGN... -->       verdicts, robust verdicts and evidence; a sentence first names what fails
     <!-- comparison: CAMPAIGN... -->    all algorithms of each run
+    <!-- section: CAMPAIGN KEY -->      tables and notes of a section of the report, for example `field-test`
     <!-- end -->
 
 With ``--check`` nothing is written. The exit code is 1 if a page has other tables, if a stored run is of other sources
@@ -25,6 +27,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+from marsyard.reports.campaign_report import create_subject, section_makers
+from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
 from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.verdicts import Status
@@ -37,20 +41,36 @@ HASHES = "rows.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
 #: Sources that determine the rows and verdicts of a run, as patterns of git.
 SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports", ":(exclude)reports/validation.json")
-_BLOCK = re.compile(r"(<!-- (results|comparison): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- (results|comparison|section): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.,-])\d[\d,]*(?:\.\d+)?(?![\w-])")
 Reports = Mapping[str, CampaignReport]
 
 
 def store_run(name: str, run: Path, folder: Path = STORED) -> None:
-    """Store the report of a run, and the SHA-256 of its rows in the form of `sha256sum`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Store the report of a run, its sections' tables, and the SHA-256 of its rows in the form of `sha256sum`."""
+    (folder / "sections").mkdir(parents=True, exist_ok=True)
+    tables = json.dumps(read_sections(run), indent=1, ensure_ascii=False)
+    (folder / "sections" / f"{name}.json").write_text(tables + "\n")
     shutil.copyfile(run / REPORT_JSON, folder / f"{name}.json")
     digest = hashlib.sha256((run / "cases.parquet").read_bytes()).hexdigest()
     path = folder / HASHES
     lines = path.read_text().splitlines() if path.exists() else []
     kept = [line for line in lines if not line.endswith(f"  {name}.parquet")]
     path.write_text("\n".join(sorted([*kept, f"{digest}  {name}.parquet"], key=lambda line: line[66:])) + "\n")
+
+
+def read_sections(run: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the blocks with tables of each section of a run's report, by the section's key."""
+    subject = create_subject(evaluate_run(run))
+    sections = [section for maker in section_makers() if (section := maker(subject)) is not None]
+    return {
+        section.key: [
+            {"heading": block.heading, "head": list(block.grid.head), "rows": block.grid.rows, "note": block.note}
+            for block in section.blocks
+            if block.grid is not None
+        ]
+        for section in sections
+    }
 
 
 def read_stored(folder: Path = STORED) -> dict[str, CampaignReport]:
@@ -62,12 +82,15 @@ def read_stored(folder: Path = STORED) -> dict[str, CampaignReport]:
     return {name: report for name, report in reports.items() if report is not None}
 
 
-def fill_page(text: str, reports: Reports) -> str:
-    """Return a page with the tables of the reports."""
+def fill_page(text: str, reports: Reports, folder: Path = STORED) -> str:
+    """Return a page with the tables of the reports, which are stored in a folder."""
     make = {"results": format_results, "comparison": format_comparison}
 
     def fill(match: re.Match[str]) -> str:
         names = match[3].split()
+        if match[2] == "section":
+            name, key = names
+            return f"{match[1]}\n{format_section(name, key, reports.get(name), folder)}{match[5]}"
         missing = ", ".join(f"`{name}`" for name in names if name not in reports)
         note = f"No run of the present program is stored of {missing}.\n\n" if missing else ""
         body = make[match[2]]({name: reports[name] for name in names if name in reports})
@@ -115,6 +138,21 @@ def format_comparison(reports: Reports) -> str:
     metric = label(next(iter(reports.values())).metric or "")
     head = ["run", "algorithm", "cases", "answered", "succeeded", f"{metric}: median", "95 % quantile", "evidence"]
     return _format_table(head, rows) + "\n"
+
+
+def format_section(name: str, key: str, report: CampaignReport | None, folder: Path) -> str:
+    """Format the tables of a section of a report; raises ValueError if the report does not have this section."""
+    if report is None:
+        return f"No run of the present program is stored of `{name}`.\n\n"
+    sections = json.loads((folder / "sections" / f"{name}.json").read_text())
+    if key not in sections:
+        raise ValueError(f"the report of {name} has no section '{key}'; allowed: {', '.join(sections)}")
+    parts = [f"Run of `{name}`: {report.evidence.title}, {report.cases:,} cases, {describe_tree(report)}."]
+    for block in sections[key]:
+        rows = [[cell.replace("|", "\\|").replace("<", "&lt;") for cell in row] for row in block["rows"]]
+        table = _format_table(block["head"], rows).rstrip()
+        parts += filter(None, (f"*{block['heading']}*" if block["heading"] else "", table, block["note"].strip()))
+    return "\n\n".join(parts) + "\n\n"
 
 
 def describe_tree(report: CampaignReport) -> str:

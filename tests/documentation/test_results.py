@@ -66,6 +66,19 @@ def test_page_has_the_verdicts_of_stored_runs_and_names_missing_ones(stored: Pat
     assert line.endswith("  dimes-a.parquet")
 
 
+def test_page_has_the_tables_of_a_section(stored: Path) -> None:
+    page = "<!-- section: dimes-a answers -->\nold\n<!-- end -->\n<!-- section: dimes-b answers -->\n<!-- end -->\n"
+    text = results.fill_page(page, results.read_stored(stored), stored)
+    lines = text.splitlines()
+    assert lines[2] == "Run of `dimes-a`: exploration, 40 cases, commit 01234567."
+    (row,) = [line for line in lines if line.startswith("| answered (of all cases) |")]
+    assert row.split("|")[2].strip() == "39 of 40"
+    assert "old" not in lines
+    assert lines[-3:] == ["No run of the present program is stored of `dimes-b`.", "", "<!-- end -->"]
+    with pytest.raises(ValueError, match=r"the report of dimes-a has no section 'none'; allowed: answers, "):
+        results.fill_page("<!-- section: dimes-a none -->\n<!-- end -->", results.read_stored(stored), stored)
+
+
 @pytest.mark.parametrize(
     ("sentence", "unknown"),
     [
