@@ -62,10 +62,20 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
             ~is_enabled[is_completed], frame[is_completed]
         )
     if subject.metric is not None and subject.bound is not None:
-        is_wrong = ~populations.success_mask(frame[is_answered], subject.metric, subject.bound)
+        has_error = _has_error(frame, subject.metric)
+        is_wrong = ~populations.success_mask(frame[has_error], subject.metric, subject.bound)
         name = f"wrong answers: error above {subject.bound:g} {split_unit(subject.metric)[1]} (of answers)"
-        fractions[name] = rates.fraction_of(is_wrong, frame[is_answered])
+        fractions[name] = rates.fraction_of(is_wrong, frame[has_error])
     return fractions
+
+
+def _has_error(frame: pd.DataFrame, metric: str) -> Bool[np.ndarray, " n"]:
+    """Create the mask of the answers that have an error: for a metric at a stated time, those that came in time.
+
+    Cases that the engine could not finish and that may have an answer are included, because they count as failures.
+    """
+    has_value = ~np.isnan(sum((numbers(frame, column) for column in metric.split(" + ")), np.zeros(len(frame))))
+    return np.asarray(populations.population_mask(frame, "valid") & (has_value | populations.engine_failed(frame)))
 
 
 #: Fractions of the errors inside the circles whose radii are reported.
@@ -114,8 +124,11 @@ def scatter_section(subject: Subject) -> Section | None:
 
 
 def _classify_answers(rows: pd.DataFrame, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers."""
-    is_answered, is_correct = populations.population_mask(rows, "valid"), populations.success_mask(rows, metric, bound)
+    """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers.
+
+    An answer without an error, for example one that came after the time of the metric, counts as no answer.
+    """
+    is_answered, is_correct = _has_error(rows, metric), populations.success_mask(rows, metric, bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 

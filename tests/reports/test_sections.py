@@ -125,6 +125,23 @@ def test_firing_section_needs_the_firing_error() -> None:
     assert find_cells(section, "time from the last image to ignition (s)")[1:] == ["18.00", "18.00", "18.00"]
 
 
+def test_late_answers_are_not_wrong_and_crashed_cases_are() -> None:
+    """A metric at a stated time has no value if the answer came later; a crashed case has no flag `answered`."""
+    frame = pd.DataFrame(
+        {
+            "fault": ["dust"] * 10,
+            "fault_size": [0.5] * 10,
+            "answered": pd.Series([True] * 8 + [False, None], dtype=object),
+            "outcome": ["VALID"] * 8 + ["NO_VALID_TRACK", "CRASHED"],
+            METRIC: [1.0] * 5 + [np.nan] * 2 + [9.0] + [np.nan] * 2,
+        }
+    )
+    *_, wrong = answer_fractions(make_subject(frame)).values()
+    assert (wrong.hits, wrong.n) == (2, 7)
+    (row,) = fault_outcomes(METRIC, 5.0).records(frame)
+    assert (row["valid"], row["invalid"], row["wrong"]) == (5, 3, 2)
+
+
 def test_faults_are_grouped_by_kind_and_size() -> None:
     frame = pd.DataFrame(
         {
