@@ -44,7 +44,7 @@ RESULTS = Path(__file__).parent / "results" / "scale_out.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "images" / "scale-out.svg"
 #: Numbers of worker threads of the model.
 THREADS = (10, 30, 100, 300, 1000, 3000, 10_000)
-#: Core-seconds of a case, by campaign (docs/performance.md, docs/localisation.md).
+#: Core-seconds of a case, by campaign (docs/performance.md).
 CASES_S = {"dimes-gusev": 0.8, "vtt-montecarlo": 3.4, "loc-jezero": 12.0}
 #: Simulated batches per thread, at least, and coefficient of variation of a case's duration.
 _BATCHES_PER_THREAD, _CASE_CV = 20, 0.3

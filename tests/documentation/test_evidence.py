@@ -54,14 +54,16 @@ def test_results_of_hazard_detection_are_generated() -> None:
     assert [match.group() for match in re.finditer(result, prose)] == []
 
 
-def test_explorations_do_not_use_the_seed_of_a_calibration() -> None:
-    """The first cases of `loc-jezero` with the campaign's own seed are a calibration."""
+def test_calibrations_of_localisation_are_those_of_the_campaign_files() -> None:
+    """The page names the runs on which options of `lvs` were set."""
     text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
-    (kind,) = re.findall(r"first 24 descents of `loc-jezero` \(an? (\w+)", text)
-    definition = load_campaign("loc-jezero").definition
-    runs = definition.calibration.runs
-    is_calibration = any(run.campaign == "loc-jezero" and run.seed == definition.seed for run in runs)
-    assert (kind == "calibration") == is_calibration
+    (sentence,) = re.findall(r"Options of `lvs` were set on (.*?);", text)
+    named = {(name, int(seed)) for name, seed in re.findall(r"`(loc-[\w-]+)` with seed (\d+)", sentence)}
+    definitions = [load_campaign(name).definition for name in catalogue() if name.startswith("loc-")]
+    calibrations = [item.calibration for item in definitions if item.calibration is not None]
+    assert named == {(run.campaign, run.seed) for item in calibrations for run in item.runs}
+    (jezero,) = [item for item in definitions if item.name == "loc-jezero"]
+    assert f"`loc-jezero` with seed {jezero.seed} (that of its file)" in sentence
 
 
 def test_span_of_inertial_data_is_that_of_the_code() -> None:

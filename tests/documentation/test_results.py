@@ -79,6 +79,11 @@ def test_page_has_the_tables_of_a_section(stored: Path) -> None:
         results.fill_page("<!-- section: dimes-a none -->\n<!-- end -->", results.read_stored(stored), stored)
 
 
+def test_run_without_stored_sections_counts_as_not_stored(stored: Path, tmp_path: Path) -> None:
+    text = results.fill_page("<!-- section: dimes-a answers -->\n<!-- end -->", results.read_stored(stored), tmp_path)
+    assert text.splitlines()[2] == "No run of the present program is stored of `dimes-a`."
+
+
 @pytest.mark.parametrize(
     ("sentence", "unknown"),
     [
