@@ -141,10 +141,14 @@ def format_comparison(reports: Reports) -> str:
 
 
 def format_section(name: str, key: str, report: CampaignReport | None, folder: Path) -> str:
-    """Format the tables of a section of a report; raises ValueError if the report does not have this section."""
-    if report is None:
+    """Format the tables of a section of a report; raises ValueError if the report does not have this section.
+
+    Runs of earlier programs can be stored without the tables of their sections.
+    """
+    path = folder / "sections" / f"{name}.json"
+    if report is None or not path.exists():
         return f"No run of the present program is stored of `{name}`.\n\n"
-    sections = json.loads((folder / "sections" / f"{name}.json").read_text())
+    sections = json.loads(path.read_text())
     if key not in sections:
         raise ValueError(f"the report of {name} has no section '{key}'; allowed: {', '.join(sections)}")
     parts = [f"Run of `{name}`: {report.evidence.title}, {report.cases:,} cases, {describe_tree(report)}."]
