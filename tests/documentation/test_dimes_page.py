@@ -1,10 +1,16 @@
-"""Tests that the tables of the page on DIMES agree with the algorithm and with the calibration of the field test."""
+"""Tests that the tables of the page on DIMES agree with the algorithm, the campaigns and the paper."""
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from marsyard.algorithms.dimes import DimesOptions, ValidityCheck
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.sampling.dispersions import Choice
+from marsyard.reports.fieldtest.presentation import FIG_11
+from marsyard.reports.fits import read_register
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "dimes.md").read_text()
 
@@ -39,8 +45,41 @@ def test_table_contains_threshold_and_contrast() -> None:
     assert "divided by the mean signal" in contrast
 
 
-@pytest.mark.parametrize("category", ["short time", "same direction", "opposite direction"])
-def test_cells_of_calibrated_runs_are_marked(category: str) -> None:
-    # Kelso's crests are calibrated, and the clouds over its run 3; columns: Pisgah 2 and 3, Kelso 2 and 3, Ivanpah 3
-    (cells,) = find_rows(f"{category}, Marsyard")
-    assert ["\\*" in cell for cell in cells] == [False, False, True, True, False]
+def test_table_of_the_field_test_has_the_values_of_the_paper() -> None:
+    (names,) = find_rows("valid answers in the paper, %")
+    runs = [name.removesuffix(" \\*").replace(" ", " Run ") for name in names]
+    for category in ("short time", "same direction", "opposite direction"):
+        (cells,) = find_rows(category)
+        assert [int(cell) for cell in cells] == [FIG_11[category, run]["percent"] for run in runs]
+    assert len(FIG_11) == 3 * len(runs)
+
+
+def test_calibrated_runs_are_marked() -> None:
+    """Kelso's crests are calibrated, and the clouds over its run 3."""
+    (names,) = find_rows("valid answers in the paper, %")
+    constants = [constant.where for constant in read_register() if constant.data.key == "dimes-fieldtest"]
+    sites = {match[1] for where in constants if (match := re.search(r"sites\.toml:sites\.(\w+)", where))}
+    assert sites == {"kelso"}
+    assert ["\\*" in name for name in names] == [name.split()[0].lower() in sites for name in names]
+
+
+def test_table_of_faults_has_the_sizes_of_the_campaign() -> None:
+    dispersion = load_campaign("dimes-offnominal").definition.dispersions["faults"]
+    assert isinstance(dispersion, Choice)
+    sizes: dict[str, list[float]] = {}
+    for fault in dispersion.values:
+        assert isinstance(fault, Mapping)
+        for name, size in fault.items():
+            sizes.setdefault(re.sub(r"_(deg|m|s)$", "", name).replace("_", " "), []).append(float(size))
+    assert f"one fault of {sum(map(len, sizes.values()))} kinds and sizes" in " ".join(PAGE.split())
+    rows = {name: (cells, index) for names, cells in fault_rows() for index, name in enumerate(names)}
+    assert rows.keys() == sizes.keys()
+    for name, (cells, index) in rows.items():
+        assert [float(size) for size in cells[1].split(";")[index].split(",")] == sizes[name], name
+
+
+def fault_rows() -> list[tuple[list[str], list[str]]]:
+    """Return the rows of the table of faults: the names of the faults in the first cell, and the other cells."""
+    lines = PAGE.partition("\n## Faults\n")[2].partition("<!-- section")[0].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line[:1] == "|"]
+    return [(cells[0].split(", "), cells[1:]) for cells in rows[2:]]

@@ -75,6 +75,8 @@ def test_page_has_the_tables_of_a_section(stored: Path) -> None:
     assert row.split("|")[2].strip() == "39 of 40"
     assert "old" not in lines
     assert lines[-3:] == ["No run of the present program is stored of `dimes-b`.", "", "<!-- end -->"]
+    without_tables = results.fill_page(page, results.read_stored(stored), stored / "none")
+    assert "No run of the present program is stored of `dimes-a`." in without_tables.splitlines()
     with pytest.raises(ValueError, match=r"the report of dimes-a has no section 'none'; allowed: answers, "):
         results.fill_page("<!-- section: dimes-a none -->\n<!-- end -->", results.read_stored(stored), stored)
 
