@@ -114,7 +114,7 @@ def run(
     - campaign: a name of `catalogue`, the path of a TOML file, or a campaign
     - algorithm, compare: algorithm under test, and algorithms that run on the same cases. A name; a class, or a
       function without parameters, that returns an algorithm; a function of the measurements that returns the estimate;
-      or an algorithm itself, of which each case receives a copy. None for the algorithm of the campaign
+      or an algorithm itself, of which each worker process receives a copy. None for the algorithm of the campaign
     - cases, seed, changes: as in `load_campaign`; only for a campaign that is given by name or path
     - jobs: number of worker processes
     - directory: new folder of the results; `runs/NAME-TIME` if None

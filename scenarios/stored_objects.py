@@ -46,9 +46,9 @@ def store_object(value: Any, folder: Path) -> str:
     """Store an algorithm that is given as an object in `folder`, if necessary, and return its specification.
 
     - a text is returned unchanged
-    - a class, or a function without parameters, is called for each case
+    - a class, or a function without parameters, is called once in each worker process
     - a function of the measurements is the method `estimate` of an estimator
-    - any other object is an algorithm itself; each case receives a copy
+    - any other object is an algorithm itself; each worker process receives a copy
 
     Raises ValueError if the object cannot be stored, for example because it holds an open file.
     """

@@ -36,9 +36,9 @@ from marsyard.sim.sensor import (
     CustomCamera,
     CustomCameraChoice,
     DetectorChoice,
-    DetectorParameters,
     ImuParameters,
     RadarParameters,
+    preset,
 )
 from marsyard.sim.sensor.imu import IMUS, ImuClass
 from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters, site
@@ -164,7 +164,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     faults: DescentFaults = DescentFaults()
     algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or custom")] = "dimes"
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
-    detector: DetectorChoice = DetectorParameters()
+    detector: DetectorChoice = Field(default_factory=lambda: preset("mer-descent-flown").detector)
     imu: ImuParameters = ImuParameters()
     inertial: InertialParameters = InertialParameters()
     approach: ApproachParameters = ApproachParameters()

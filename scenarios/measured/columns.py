@@ -18,7 +18,7 @@ _CASE = (
     condition("max_translation_m", "largest distance between two images", "largest distance between two images"),
     outcome("matches", "matched points of all image pairs"),
     outcome("pairs_matched", "pairs of images with enough matches"),
-    error("outlier_fraction", "fraction of the matches that disagree with the poses"),
+    error("outlier_fraction", "fraction of the matches that disagree with the essential matrix"),
     error("residual_median_px", "median distance of the matches from the poses' epipolar lines"),
     error("residual_90_percent_px", "90 % quantile of the distance from the epipolar lines"),
     error("residual_worst_pair_px", "median distance of the worst pair"),

@@ -7,8 +7,10 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes.views import binned_size_for
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
+from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import site
 
 #: A site on Mars and a site on Earth.
@@ -111,3 +113,11 @@ def test_indivisible_image_size_is_rejected_with_suggestion() -> None:
 def test_indivisible_row_summing_is_rejected() -> None:
     with pytest.raises(ValidationError, match="rows_summed 4 does not divide the 1023 camera rows"):
         DescentScenarioParameters.model_validate({"camera": {"rows": 1023}})
+
+
+def test_default_detector_is_that_of_the_flown_camera() -> None:
+    """The flown images contain a pattern of the response that the calibration lacks; other values keep it."""
+    assert DescentScenarioParameters().detector == preset("mer-descent-flown").detector
+    campaign = load_campaign("dimes-gusev")
+    residual = campaign.parameters(0).model_dump()["detector"]["residual_spread"]
+    assert residual == preset("mer-descent-flown").detector.residual_spread > 0.0
