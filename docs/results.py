@@ -60,14 +60,15 @@ def store_run(name: str, run: Path, folder: Path = STORED) -> None:
 
 
 def read_sections(run: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return the blocks with tables of each section of a run's report, by the section's key."""
+    """Return the blocks with tables, or with texts alone, of each section of a run's report, by the section's key."""
     subject = create_subject(evaluate_run(run))
     sections = [section for maker in section_makers() if (section := maker(subject)) is not None]
     return {
         section.key: [
-            {"heading": block.heading, "head": list(block.grid.head), "rows": block.grid.rows, "note": block.note}
+            {"heading": block.heading, "text": block.text, "note": block.note}
+            | ({} if block.grid is None else {"head": list(block.grid.head), "rows": block.grid.rows})
             for block in section.blocks
-            if block.grid is not None
+            if block.grid is not None or (block.text + block.note and not block.figures)
         ]
         for section in sections
     }
@@ -153,9 +154,11 @@ def format_section(name: str, key: str, report: CampaignReport | None, folder: P
         raise ValueError(f"the report of {name} has no section '{key}'; allowed: {', '.join(sections)}")
     parts = [f"Run of `{name}`: {report.evidence.title}, {report.cases:,} cases, {describe_tree(report)}."]
     for block in sections[key]:
-        rows = [[cell.replace("|", "\\|").replace("<", "&lt;") for cell in row] for row in block["rows"]]
-        table = _format_table(block["head"], rows).rstrip()
-        parts += filter(None, (f"*{block['heading']}*" if block["heading"] else "", table, block["note"].strip()))
+        parts += filter(None, (f"*{block['heading']}*" if block["heading"] else "", block["text"].strip()))
+        if "rows" in block:
+            rows = [[cell.replace("|", "\\|").replace("<", "&lt;") for cell in row] for row in block["rows"]]
+            parts.append(_format_table(block["head"], rows).rstrip())
+        parts += filter(None, (block["note"].strip(),))
     return "\n\n".join(parts) + "\n\n"
 
 
