@@ -5,6 +5,7 @@ tables of its report's sections in `sections/CAMPAIGN.json`, and the hash of its
 written between two comments:
 
     <!-- results: CAMPAIGN... -->       verdicts, robust verdicts and evidence; a sentence first names what fails
+    <!-- summary: CAMPAIGN... -->       the requirements of each campaign by verdict
     <!-- comparison: CAMPAIGN... -->    all algorithms of each run
     <!-- section: CAMPAIGN KEY -->      tables and notes of a section of the report, for example `field-test`
     <!-- end -->
@@ -41,7 +42,7 @@ HASHES = "rows.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
 #: Sources that determine the rows and verdicts of a run, as patterns of git.
 SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports", ":(exclude)reports/validation.json")
-_BLOCK = re.compile(r"(<!-- (results|comparison|section): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- (results|summary|comparison|section): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.,-])\d[\d,]*(?:\.\d+)?(?![\w-])")
 Reports = Mapping[str, CampaignReport]
 
@@ -85,7 +86,7 @@ def read_stored(folder: Path = STORED) -> dict[str, CampaignReport]:
 
 def fill_page(text: str, reports: Reports, folder: Path = STORED) -> str:
     """Return a page with the tables of the reports, which are stored in a folder."""
-    make = {"results": format_results, "comparison": format_comparison}
+    make = {"results": format_results, "summary": format_summary, "comparison": format_comparison}
 
     def fill(match: re.Match[str]) -> str:
         names = match[3].split()
@@ -122,6 +123,25 @@ def format_results(reports: Reports) -> str:
     text = f"{sentence}\n\n{_format_table(head, rows)}\n"
     robust = "\n".join(reaches)
     return f"{text}Robust verdicts ([how far a PASS reaches](ROBUST)):\n\n{robust}\n\n" if robust else text
+
+
+def format_summary(reports: Reports) -> str:
+    """Format a row per campaign: its requirements that are met, that are not met, and that are undecided."""
+    if not reports:
+        return ""
+    rows = []
+    for name, report in reports.items():
+        groups: dict[str, list[str]] = {"met": [], "failed": [], "undecided": []}
+        for verdict in report.verdicts:
+            status = verdict.status
+            group = "met" if status.is_met else "failed" if status is Status.FAIL else "undecided"
+            detail = re.sub(r"PASS \((.*)\)", r"\1", status) if status.is_met and status is not Status.PASS else ""
+            groups[group].append(f"{verdict.requirement_id} ({detail.lower()})" if detail else verdict.requirement_id)
+        texts = [", ".join(names) or NOTHING for names in groups.values()]
+        algorithm = f"`{report.algorithm_details[0].name}`" if report.algorithm_details else NOTHING
+        rows.append([f"`{name}`", algorithm, f"{report.cases:,}", *texts, report.evidence.title])
+    head = ["campaign", "algorithm", "cases", "met", "not met (FAIL)", "undecided (INSUFFICIENT)", "evidence"]
+    return _format_table(head, rows) + "\n"
 
 
 def format_comparison(reports: Reports) -> str:
@@ -215,7 +235,9 @@ def check(reports: Reports) -> list[str]:
     """Return the faults of the pages and of the stored runs."""
     faults = []
     for name, report in reports.items():
-        command = ["git", "-C", str(ROOT), "diff", "--quiet", str(report.git_commit), "--", *SOURCES]
+        # the record of confirmations is the only file that `tools/confirm_queue.py` lets change
+        commit = str(report.git_commit).removesuffix("+changes" if report.evidence.claim else "")
+        command = ["git", "-C", str(ROOT), "diff", "--quiet", commit, "--", *SOURCES]
         if subprocess.run(command, capture_output=True, check=False).returncode:  # noqa: S603
             faults.append(f"{name}: its sources ({describe_tree(report)}) are not the present ones: run it again")
     values = {name: json.loads((STORED / f"{name}.json").read_text()) for name in reports}

@@ -66,6 +66,13 @@ def test_page_has_the_verdicts_of_stored_runs_and_names_missing_ones(stored: Pat
     assert line.endswith("  dimes-a.parquet")
 
 
+def test_summary_has_the_requirements_by_verdict(stored: Path) -> None:
+    text = results.fill_page("<!-- summary: dimes-a dimes-b -->\n<!-- end -->", results.read_stored(stored), stored)
+    (row,) = [line for line in text.splitlines() if line.startswith("| `dimes-a`")]
+    assert [cell.strip() for cell in row.strip("|").split("|")][2:] == ["40", "LOOSE", "DIMES-VEL", "–", "exploration"]
+    assert "No run of the present program is stored of `dimes-b`." in text
+
+
 def test_page_has_the_tables_of_a_section(stored: Path) -> None:
     page = "<!-- section: dimes-a answers -->\nold\n<!-- end -->\n<!-- section: dimes-b answers -->\n<!-- end -->\n"
     text = results.fill_page(page, results.read_stored(stored), stored)
