@@ -7,6 +7,7 @@ written between two comments:
     <!-- results: CAMPAIGN... -->       verdicts, robust verdicts and evidence; a sentence first names what fails
     <!-- summary: CAMPAIGN... -->       the requirements of each campaign by verdict
     <!-- comparison: CAMPAIGN... -->    all algorithms of each run
+    <!-- missed: PAGE... -->            rows of docs/PAGE.md that miss their limit (`validation`, `performance`)
     <!-- section: CAMPAIGN KEY -->      tables and notes of a section of the report, for example `field-test`
     <!-- end -->
 
@@ -42,7 +43,9 @@ HASHES = "rows.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
 #: Sources that determine the rows and verdicts of a run, as patterns of git.
 SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports", ":(exclude)reports/validation.json")
-_BLOCK = re.compile(r"(<!-- (results|summary|comparison|section): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(
+    r"(<!-- (results|summary|comparison|section|missed): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL
+)
 _NUMBER = re.compile(r"(?<![\w.,-])\d[\d,]*(?:\.\d+)?(?![\w-])")
 Reports = Mapping[str, CampaignReport]
 
@@ -90,6 +93,8 @@ def fill_page(text: str, reports: Reports, folder: Path = STORED) -> str:
 
     def fill(match: re.Match[str]) -> str:
         names = match[3].split()
+        if match[2] == "missed":
+            return f"{match[1]}\n{format_missed(names)}{match[5]}"
         if match[2] == "section":
             name, key = names
             return f"{match[1]}\n{format_section(name, key, reports.get(name), folder)}{match[5]}"
@@ -180,6 +185,18 @@ def format_section(name: str, key: str, report: CampaignReport | None, folder: P
             parts.append(_format_table(block["head"], rows).rstrip())
         parts += filter(None, (block["note"].strip(),))
     return "\n\n".join(parts) + "\n\n"
+
+
+def format_missed(pages: Sequence[str]) -> str:
+    """List the rows of generated pages that miss their limit: quantity, value (scaled, if it is a time) and limit."""
+    items = []
+    for page in pages:
+        for line in (ROOT / "docs" / f"{page}.md").read_text().splitlines():
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            if "**missed**" in cells:
+                name, limit, *values = cells[: cells.index("**missed**")]
+                items.append(f"- {name}: {[value for value in values if value][-1]}, limit {limit}")
+    return "\n".join(items or ["None."]) + "\n\n"
 
 
 def describe_tree(report: CampaignReport) -> str:

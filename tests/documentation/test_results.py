@@ -73,6 +73,20 @@ def test_summary_has_the_requirements_by_verdict(stored: Path) -> None:
     assert "No run of the present program is stored of `dimes-b`." in text
 
 
+def test_missed_rows_of_a_page_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        "| a (s) | <= 2 | 5 | 3 | **missed** |",
+        "| b | <= 2 | 1 | 1 | met |",
+        "| c (GB) | >= 1 | 0.5 | | **missed** |",
+    ]
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "times.md").write_text("\n".join(rows))
+    (tmp_path / "docs" / "checks.md").write_text("| d | at most 1 px | 2 px | met | |\n")
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    assert results.format_missed(["times"]) == "- a (s): 3, limit <= 2\n- c (GB): 0.5, limit >= 1\n\n"
+    assert results.format_missed(["checks"]) == "None.\n\n"
+
+
 def test_page_has_the_tables_of_a_section(stored: Path) -> None:
     page = "<!-- section: dimes-a answers -->\nold\n<!-- end -->\n<!-- section: dimes-b answers -->\n<!-- end -->\n"
     text = results.fill_page(page, results.read_stored(stored), stored)
