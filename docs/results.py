@@ -155,7 +155,8 @@ def format_comparison(reports: Reports) -> str:
     for name, report in reports.items():
         for entry in report.sections.get("algorithms", {}).get("algorithms", ()):
             errors = [NOTHING if entry[key] is None else number(entry[key]) for key in ("median", "p95")]
-            counts = [NOTHING if entry[key] is None else f"{entry[key]:,}" for key in ("cases", "answered", "succeeded")]
+            numbers = [entry[key] for key in ("cases", "answered", "succeeded")]
+            counts = [NOTHING if count is None else f"{count:,}" for count in numbers]
             tree = f"{report.evidence.title}, {describe_tree(report)}"
             # the section contains labels, which are prefixes of columns: `dimes_plus` for the algorithm `dimes-plus`
             rows.append([f"`{name}`", f"`{entry['name'].replace('_', '-')}`", *counts, *errors, tree])
