@@ -21,7 +21,6 @@ import hashlib
 import json
 import math
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,9 +52,10 @@ Reports = Mapping[str, CampaignReport]
 def store_run(name: str, run: Path, folder: Path = STORED) -> None:
     """Store the report of a run, its sections' tables, and the SHA-256 of its rows in the form of `sha256sum`."""
     (folder / "sections").mkdir(parents=True, exist_ok=True)
-    tables = json.dumps(read_sections(run), indent=1, ensure_ascii=False)
-    (folder / "sections" / f"{name}.json").write_text(tables + "\n")
-    shutil.copyfile(run / REPORT_JSON, folder / f"{name}.json")
+    contents = {"sections/": read_sections(run), "": json.loads((run / REPORT_JSON).read_text())}
+    for prefix, content in contents.items():
+        text = json.dumps(content, separators=(",", ":"), ensure_ascii=False)
+        (folder / f"{prefix}{name}.json").write_text(text + "\n")
     digest = hashlib.sha256((run / "cases.parquet").read_bytes()).hexdigest()
     path = folder / HASHES
     lines = path.read_text().splitlines() if path.exists() else []
