@@ -13,7 +13,7 @@ import numpy as np
 from marsyard.reports.case_evidence import Mask
 from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import attainable_risk, count_sizes
+from marsyard.reports.statistics.clusters import attainable_risk, count_sizes, select_counted
 from marsyard.reports.statistics.sequential import SequentialTest, confidence_at
 from marsyard.reports.verdicts import Verdict
 
@@ -93,7 +93,8 @@ def _add_bounds_at_later_look(verdict: Verdict, cases: ClusteredCases, in_first_
 
 def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, risk: float) -> SequentialTest:
     """Create the test at looks after the first, for a rate of failures (PASS) or of successes (FAIL)."""
-    sizes = count_sizes(np.bincount(cases.index[in_first_look]))
+    index = cases.index[in_first_look]
+    sizes = count_sizes(np.bincount(index[select_counted(index)]))
     first_n = int((cases.is_first_on_terrain & cases.member & in_first_look).sum())
     first_risk = attainable_risk(sizes, rate, risk)
     # this risk is known only if all cases belong to the population; otherwise it is at most the permitted risk

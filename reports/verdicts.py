@@ -183,6 +183,9 @@ class Verdict:
         if evidence.failure_pairs:
             text += f" ({count(evidence.failure_pairs, 'pair')} of failures on one terrain)"
         text += ". The bounds hold for every distribution of failure rates over terrains."
+        if evidence.counted:
+            first = "first case" if evidence.counted == 1 else f"first {evidence.counted} cases"
+            text += f" They use the {first} of each terrain."
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
         if self.additional_cases and self.decide_by != ESTIMATE:

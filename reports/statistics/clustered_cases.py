@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Int
 
-from marsyard.reports.statistics.clusters import TerrainCounts
+from marsyard.reports.statistics.clusters import TerrainCounts, max_counted, select_counted
 
 #: Fraction of the risk of a wrong bound that the bound of the rate of members uses.
 _MEMBER_RISK_FRACTION = 0.1
@@ -25,13 +25,15 @@ _MIN_MEMBER_RATE = 0.01
 class TerrainEvidence:
     """Numbers of terrains with a case of the population, with a failure, and with a success.
 
-    failure_pairs: number of pairs of failures on one terrain
+    - failure_pairs: number of pairs of failures on one terrain
+    - counted: the bounds use the first so many cases of each terrain; None if they use all
     """
 
     terrains: int
     failed_terrains: int
     successful_terrains: int
     failure_pairs: int
+    counted: int | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,14 @@ class ClusteredCases:
     @cached_property
     def failures(self) -> TerrainCounts:
         """Failures of the population."""
-        return TerrainCounts.of(self.member & ~self.success, self.index)
+        return self._count(self.member & ~self.success)
+
+    @cached_property
+    def _counted(self) -> Bool[np.ndarray, " n"]:
+        return select_counted(self.index)
+
+    def _count(self, event: Bool[np.ndarray, " n"]) -> TerrainCounts:
+        return TerrainCounts.of(event[self._counted], self.index[self._counted])
 
     @cached_property
     def is_first_on_terrain(self) -> Bool[np.ndarray, " n"]:
@@ -70,11 +79,13 @@ class ClusteredCases:
         """Count the terrains by the outcomes of their cases."""
         members = np.bincount(self.index, weights=self.member)
         failures = np.bincount(self.index, weights=self.member & ~self.success)
+        counted = None if self._counted.all() else max_counted(np.bincount(self.index))
         return TerrainEvidence(
             terrains=int((members > 0).sum()),
             failed_terrains=int((failures > 0).sum()),
             successful_terrains=int((members > failures).sum()),
             failure_pairs=int((failures * (failures - 1.0) / 2.0).sum()),
+            counted=counted,
         )
 
     def max_failure_rate(self, risk: float) -> float:
@@ -112,14 +123,14 @@ class ClusteredCases:
         """Compute the lower bound of the failure rate in the population."""
         max_member_rate, other_risk = 1.0, risk
         if not self.member.all():
-            max_member_rate = TerrainCounts.of(self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
+            max_member_rate = self._count(self.member).max_rate(_MEMBER_RISK_FRACTION * risk)
             other_risk = (1.0 - _MEMBER_RISK_FRACTION) * risk
-        no_failure = TerrainCounts.of(~self.member | self.success, self.index)
+        no_failure = self._count(~self.member | self.success)
         return (1.0 - no_failure.max_rate(other_risk)) / max_member_rate
 
     def _min_member_rate(self, risk: float) -> tuple[float, float]:
         """Return the lower bound of the rate of members, and the part of the risk that it does not use."""
         if self.member.all():
             return 1.0, risk
-        max_other_rate = TerrainCounts.of(~self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
+        max_other_rate = self._count(~self.member).max_rate(_MEMBER_RISK_FRACTION * risk)
         return 1.0 - max_other_rate, (1.0 - _MEMBER_RISK_FRACTION) * risk

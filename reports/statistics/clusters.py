@@ -6,7 +6,8 @@ probability B(k; n, theta). The rate q of a case is the mean of G. The numbers n
 
 The statistic is S = sum of k^2 over the terrains: the number of events, plus twice the number of pairs of events on one
 terrain. Events that are spread over terrains are therefore stronger evidence for a low rate than as many events on one
-terrain. `event_scores` limits the number of values of S for large n.
+terrain. `event_scores` limits the number of values of S for large n, and `select_counted` the number of cases that the
+bounds use, because their cost increases with the largest value of S.
 
 The p-value of a rate q is the supremum of P(S <= observed) over all G with the mean q (the least favourable mixing
 distribution). For a given distribution of all other terrains, P is linear in the G of one terrain, so its maximum has
@@ -58,6 +59,39 @@ def event_scores(sizes: Sizes) -> Int[np.ndarray, " _"]:
     scale = max(largest, _MAX_SQUARED)
     # integers: -(-a // b) rounds a / b up
     return np.asarray(-(-(events**2) * _MAX_SQUARED**2 // scale**2))
+
+
+#: Maximum cost of a bound, about 1 core-s: the largest value of its statistic, times the number of different numbers of
+#: cases on a terrain.
+_MAX_COST = 30_000
+
+
+def max_counted(cases_on_terrain: Int[np.ndarray, " terrains"]) -> int:
+    """Return how many cases of a terrain the bounds use: all if their cost permits it, or else 1 to 16.
+
+    It depends on the design only, so the bounds remain exact. The other cases would add little: however many cases are
+    on a terrain, without an event it counts as one.
+    """
+    largest = int(cases_on_terrain.max(initial=1))
+    numbers = [largest, *range(min(_MAX_SQUARED, largest), 1, -1)]
+    sizes = (count_sizes(np.minimum(cases_on_terrain, number)) for number in numbers)
+    costs = (largest_statistic(size) * len(size) for size in sizes)
+    return next((number for number, cost in zip(numbers, costs, strict=True) if cost <= _MAX_COST), 1)
+
+
+def select_counted(index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Select the cases that the bounds use: the first ones of each terrain (`max_counted`).
+
+    index: number of each case's terrain from 0, in the order of the cases
+    """
+    cases = np.bincount(index)
+    counted = max_counted(cases)
+    if counted >= cases.max(initial=0):
+        return np.ones(index.size, dtype=np.bool_)
+    order = np.argsort(index, kind="stable")
+    rank = np.empty_like(index)
+    rank[order] = np.arange(index.size) - (np.cumsum(cases) - cases)[index[order]]
+    return np.asarray(rank < counted)
 
 
 def largest_statistic(sizes: Sizes) -> int:

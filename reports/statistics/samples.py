@@ -28,7 +28,13 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.clusters import (
+    count_sizes,
+    event_scores,
+    max_statistic,
+    number_terrains,
+    select_counted,
+)
 from marsyard.reports.statistics.proportions import Interval, check_confidence
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
@@ -207,14 +213,16 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
     Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
     the bound is the smallest value for which this probability is at least the confidence.
     """
-    ordered = np.sort(values)
-    n = ordered.size
     if groups is None or not is_shared(groups):
         # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound
-        rank = int(stats.binom.ppf(confidence, n, quantile))
-        return float(ordered[rank]) if rank < n else math.inf
-    # `index` is that of the sorted values; each value has `larger` larger values on its terrain
-    index = number_terrains(groups)[np.argsort(values, kind="stable")]
+        rank = int(stats.binom.ppf(confidence, values.size, quantile))
+        return float(np.sort(values)[rank]) if rank < values.size else math.inf
+    index = number_terrains(groups)
+    counted = select_counted(index)
+    values, index = values[counted], index[counted]
+    # of the sorted values; each has `larger` larger values on its terrain
+    order = np.argsort(values, kind="stable")
+    ordered, index = values[order], index[order]
     sizes = count_sizes(np.bincount(index))
     limit = max_statistic(sizes, 1.0 - quantile, 1.0 - confidence)
     larger = pd.Series(index[::-1]).groupby(index[::-1]).cumcount().to_numpy()

@@ -17,6 +17,7 @@ from marsyard.reports.statistics.clusters import (
     event_scores,
     max_statistic,
     number_terrains,
+    select_counted,
 )
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 
@@ -205,6 +206,43 @@ def test_search_for_a_statistic_ends_at_a_sufficient_probability(monkeypatch: py
     probability, _ = clusters._find_supremum(sizes, 11, rate, risk)
     # the grid of support points is sufficient: 17 evaluations without the limit
     assert (calls[0], risk < probability <= p_values[11]) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("index", "counted"),
+    [
+        (np.tile(np.arange(300), 4), 4),  # all
+        (np.tile(np.arange(300), 40), 10),  # 300 terrains of 10: the statistic is at most 30,000
+        (np.tile(np.arange(3), 40_000), 40_000),  # all: scores of many cases on a terrain are rounded
+        (np.append(np.tile(np.arange(1000), 2), np.repeat(np.arange(1000, 1100), 60)), 10),
+        (np.tile(np.arange(40_000), 3), 1),
+    ],
+)
+def test_bounds_use_the_first_cases_of_each_terrain_if_all_cost_too_much(index: np.ndarray, counted: int) -> None:
+    expected = [np.flatnonzero(index == terrain)[:counted] for terrain in range(3)]
+    selected = np.flatnonzero(select_counted(index))
+    for terrain, cases in enumerate(expected):
+        np.testing.assert_array_equal(selected[index[selected] == terrain], cases)
+    assert selected.size == np.minimum(np.bincount(index), counted).sum()
+    evidence = ClusteredCases.of(np.ones(index.size, dtype=bool), index).count_terrains()
+    assert evidence.counted == (None if selected.size == index.size else counted)
+
+
+@pytest.mark.parametrize("correlation", [0.02, 0.3])
+def test_bounds_of_many_cases_on_shared_terrains_cover_the_true_rate(correlation: float) -> None:
+    rng, rate, trials = np.random.default_rng(8), 0.05, 1000
+    index, n_missed = np.tile(np.arange(200), 60), np.zeros(2)
+    total = (1.0 - correlation) / correlation
+    for _ in range(trials):
+        success = rng.random(index.size) >= rng.beta(rate * total, (1.0 - rate) * total, 200)[index]
+        counts = ClusteredCases.of(success, index).failures, ClusteredCases.of(~success, index).failures
+        n_missed += [
+            count.statistic <= max_statistic(count.sizes, limit, 0.1)
+            for count, limit in zip(counts, (rate, 1.0 - rate), strict=True)
+        ]
+    assert counts[0].sizes == ((12, 200),)
+    # standard deviation of a frequency of 10 % of 1000: 0.95 %
+    assert (n_missed / trials <= 0.1 + 3 * 0.0095).all()
 
 
 def test_spread_failures_are_stronger_evidence_than_failures_on_one_terrain() -> None:
