@@ -1,8 +1,8 @@
 """Tables of results in README and pages, from the stored `report.json` of runs: ``python docs/results.py [RUN...]``.
 
 A run folder is stored as `benchmarks/results/reports/CAMPAIGN.json` (with ``NAME=FOLDER`` under another name), the
-tables of its report's sections in `sections/CAMPAIGN.json`, and the hash of its rows in `rows.sha256`. The tables are
-written between two comments:
+tables of its report's sections in `sections/CAMPAIGN.json`, and the hashes of its rows and of the sources of the report
+in `rows.sha256` and `sources.sha256`. The tables are written between two comments:
 
     <!-- results: CAMPAIGN... -->       verdicts, robust verdicts and evidence; a sentence first names what fails
     <!-- summary: CAMPAIGN... -->       the requirements of each campaign by verdict
@@ -11,9 +11,9 @@ written between two comments:
     <!-- section: CAMPAIGN KEY -->      tables and notes of a section of the report, for example `field-test`
     <!-- end -->
 
-With ``--check`` nothing is written. The exit code is 1 if a page has other tables, if a stored run is of other sources
-than the present ones, or if a sentence that names one stored campaign contains a number that neither its report nor its
-campaign file contains.
+With ``--check`` nothing is written. The exit code is 1 if a page has other tables, if a stored run or its report is of
+other sources than the present ones, or if a sentence that names one stored campaign contains a number that neither its
+report nor its campaign file contains.
 """
 
 import argparse
@@ -38,10 +38,13 @@ from marsyard.scenarios.systems import catalogue
 
 ROOT = Path(__file__).parents[1]
 STORED = ROOT / "benchmarks" / "results" / "reports"
-HASHES = "rows.sha256"
+HASHES, REPORT_HASHES = "rows.sha256", "sources.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
-#: Sources that determine the rows and verdicts of a run, as patterns of git.
-SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports", ":(exclude)reports/validation.json")
+#: Sources that determine the rows of a run, and those that determine its report, as patterns of git.
+SOURCES, REPORT_SOURCES = (
+    ("sim", "algorithms", "scenarios", "campaigns"),
+    ("reports", ":(exclude)reports/validation.json"),
+)
 _BLOCK = re.compile(
     r"(<!-- (results|summary|comparison|section|missed): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL
 )
@@ -56,11 +59,30 @@ def store_run(name: str, run: Path, folder: Path = STORED) -> None:
     for prefix, content in contents.items():
         text = json.dumps(content, separators=(",", ":"), ensure_ascii=False)
         (folder / f"{prefix}{name}.json").write_text(text + "\n")
-    digest = hashlib.sha256((run / "cases.parquet").read_bytes()).hexdigest()
-    path = folder / HASHES
+    _write_hash(folder / HASHES, f"{name}.parquet", hashlib.sha256((run / "cases.parquet").read_bytes()).hexdigest())
+    _write_hash(folder / REPORT_HASHES, name, hash_report_sources())
+
+
+def hash_report_sources() -> str:
+    """Return the SHA-256 of the sources of reports."""
+    files = [ROOT / line for line in _git("ls-files", "--", *REPORT_SOURCES).stdout.splitlines()]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files if path.exists())).hexdigest()
+
+
+def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)  # noqa: S603, S607
+
+
+def _write_hash(path: Path, name: str, digest: str) -> None:
+    """Write the hash of a name, or replace it, in a file that is sorted by name."""
+    hashes = read_hashes(path) | {name: digest}
+    path.write_text("".join(f"{hashes[key]}  {key}\n" for key in sorted(hashes)))
+
+
+def read_hashes(path: Path) -> dict[str, str]:
+    """Read hashes by name; none if there is no file."""
     lines = path.read_text().splitlines() if path.exists() else []
-    kept = [line for line in lines if not line.endswith(f"  {name}.parquet")]
-    path.write_text("\n".join(sorted([*kept, f"{digest}  {name}.parquet"], key=lambda line: line[66:])) + "\n")
+    return {name: digest for digest, name in (line.split("  ") for line in lines)}
 
 
 def read_sections(run: Path) -> dict[str, list[dict[str, Any]]]:
@@ -251,13 +273,14 @@ def _leaves(value: Any) -> Iterator[float]:
 
 def check(reports: Reports) -> list[str]:
     """Return the faults of the pages and of the stored runs."""
-    faults = []
+    faults, hashes, present = [], read_hashes(STORED / REPORT_HASHES), hash_report_sources()
     for name, report in reports.items():
         # the record of confirmations is the only file that `tools/confirm_queue.py` lets change
         commit = str(report.git_commit).removesuffix("+changes" if report.evidence.claim else "")
-        command = ["git", "-C", str(ROOT), "diff", "--quiet", commit, "--", *SOURCES]
-        if subprocess.run(command, capture_output=True, check=False).returncode:  # noqa: S603
+        if _git("diff", "--quiet", commit, "--", *SOURCES).returncode:
             faults.append(f"{name}: its sources ({describe_tree(report)}) are not the present ones: run it again")
+        if hashes.get(name) != present:
+            faults.append(f"{name}: its report is of other sources: run `marsyard report` on its folder, and store it")
     values = {name: json.loads((STORED / f"{name}.json").read_text()) for name in reports}
     files = {name: path.read_text() for name, path in catalogue().items()}
     sources = {name: files.get(report.campaign, "") for name, report in reports.items()}

@@ -64,6 +64,7 @@ def test_page_has_the_verdicts_of_stored_runs_and_names_missing_ones(stored: Pat
     assert results.fill_page(text, reports) == text
     (line,) = (stored / results.HASHES).read_text().splitlines()
     assert line.endswith("  dimes-a.parquet")
+    assert results.read_hashes(stored / results.REPORT_HASHES) == {"dimes-a": results.hash_report_sources()}
 
 
 def test_summary_has_the_requirements_by_verdict(stored: Path) -> None:
