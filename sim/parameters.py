@@ -27,26 +27,28 @@ class Parameters(BaseModel):
         """Complete tables whose default is a preset."""
         if not isinstance(values, Mapping):
             return values
-        presets = {
-            name: _complete_table(field.default, values[name])
-            for name, field in cls.model_fields.items()
-            if isinstance(field.default, BaseModel) and isinstance(values.get(name), Mapping)
-        }
-        return {**values, **presets} if presets else values
+        completed = {}
+        for name, field in cls.model_fields.items():
+            if isinstance(values.get(name), Mapping):
+                default = field.get_default(call_default_factory=True)
+                if isinstance(default, BaseModel):
+                    completed[name] = _complete_table(default, values[name])
+        return {**values, **completed} if completed else values
 
 
 def _complete_table(preset: BaseModel, table: Mapping[Any, Any]) -> Mapping[Any, Any]:
     """Complete a table by the values of the field's default, if these are not the defaults of their class.
 
-    A file that changes one value of a preset, such as the noise of an instrument, then keeps the other values. A table
-    with keys of another class, such as a custom instrument, is returned unchanged.
+    A table that changes one value of a preset, such as the noise of an instrument, then keeps the other values. A table
+    with keys of another class, such as a custom instrument, or with the name of a file is returned unchanged.
     """
     kind = type(preset)
     try:
         is_preset = preset != kind()
     except ValidationError:
         is_preset = True
-    if not is_preset or not table.keys() <= kind.model_fields.keys():
+    names_file = table.get("file") is not None
+    if not is_preset or names_file or not table.keys() <= kind.model_fields.keys():
         return table
     values = {name: getattr(preset, name) for name in kind.model_fields}
     for name, value in table.items():

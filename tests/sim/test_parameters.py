@@ -1,14 +1,37 @@
 """Tests of parameter tables: a table that changes some values of a preset keeps the other values of the preset."""
 
+from collections.abc import Iterator
+
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.localisation.camera import LANDER_DETECTOR
 from marsyard.scenarios.localisation.instruments import RADAR
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
+from marsyard.scenarios.systems import catalogue
+from marsyard.sim.parameters import merge_parameters
 from marsyard.sim.sensor import ImuParameters
+
+
+def _list_single_values(model: BaseModel) -> Iterator[dict[str, object]]:
+    """List nested tables with one value of a model, the first number of each of its tables."""
+    values = {name: getattr(model, name) for name in type(model).model_fields}
+    numbers = [name for name, value in values.items() if isinstance(value, float | int)]
+    yield from ({name: values[name]} for name in numbers[:1])
+    for name, value in values.items():
+        if isinstance(value, BaseModel):
+            yield from ({name: table} for table in _list_single_values(value))
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_a_value_that_is_set_to_itself_changes_nothing(name: str) -> None:
+    campaign = load_campaign(name)
+    parameters = campaign.base_parameters()
+    for change in _list_single_values(parameters):
+        values = merge_parameters(campaign.definition.parameters, change)
+        assert campaign.scenario.parameters_type.model_validate(values) == parameters, change
 
 
 def test_table_keeps_the_other_values_of_a_preset() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
 
 CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
@@ -99,6 +100,12 @@ band_nm = [600.0, 800.0]
     for name in ("responsivity_e_s", "exposure_s", "full_well_e", "gain_e_dn", "read_noise_e", "readout_row_s"):
         assert getattr(actual, name) == pytest.approx(getattr(expected, name), rel=1e-3), name
     assert actual.dark_e_s * actual.dark_growth == pytest.approx(expected.dark_e_s * expected.dark_growth)
+
+
+def test_datasheet_replaces_the_detector_of_a_preset(tmp_path: Path) -> None:
+    path = write_datasheet(tmp_path)
+    detector = LandingScenarioParameters.model_validate({"detector": {"file": str(path), "bits": 9}}).detector
+    assert detector == read_datasheet(path).parameters().model_copy(update={"file": str(path), "bits": 9})
 
 
 def test_stored_parameters_do_not_need_the_datasheet_file(tmp_path: Path) -> None:
