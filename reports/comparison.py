@@ -159,7 +159,7 @@ def comparison_grids(
         {
             "Algorithm": lambda result: result.name,
             "Answered": lambda result: percent(result.answered / result.cases),
-            "Failed": lambda result: f"{result.failed:,}",
+            "Not finished": lambda result: f"{result.failed:,}",
             "Within the bound (of all cases)": lambda result: (
                 NOTHING if result.succeeded is None else percent(result.succeeded / result.cases)
             ),

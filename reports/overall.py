@@ -13,12 +13,15 @@ from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.reports.populations import engine_failed
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics.proportions import minimum_sample_size, proportion_lower
+from marsyard.reports.statistics.sequential import SequentialTest
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
-from marsyard.reports.wording import count, format_fraction
+from marsyard.reports.wording import count, format_fraction, percent
 
 #: Confidence of the lower bound of the fraction of the cases that belong to a population; high, so that the stated
 #: number of cases is sufficient.
 _FRACTION_CONFIDENCE = 0.99
+#: Rate of failures, as a fraction of the permitted rate, above which the number of cases for PASS is not stated.
+_NEAR_LIMIT = 0.95
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,20 @@ def find_remedy(verdicts: Sequence[Verdict], cases: int) -> Remedy:
     text = f"{_needed_text(largest)}, all without a failure, would be enough"
     if largest.population != "all":
         text += f": about {count(number, 'case')}, of which some do not belong to the population"
-    return Remedy(number, f"{text}.{_new_campaign_text(populated, cases, cases + number)}")
+    at_rate = "".join(_text_at_observed_rate(verdict) for verdict in populated)
+    return Remedy(number, f"{text}.{at_rate}{_new_campaign_text(populated, cases, cases + number)}")
+
+
+def _text_at_observed_rate(verdict: Verdict) -> str:
+    """State the cases that lead to PASS if failures continue at their rate so far; empty without a failure."""
+    if not verdict.failures or verdict.clustered is not None or verdict.decide_by == ESTIMATE:
+        return ""
+    rate, allowed = verdict.failures / verdict.n, 1.0 - verdict.probability
+    text = f" If failures of {verdict.requirement_id} continue at their rate so far ({percent(rate)})"
+    if rate > _NEAR_LIMIT * allowed:
+        return f"{text}, more cases are not expected to lead to PASS: it permits {percent(allowed)}."
+    test = SequentialTest(allowed, 1.0 - verdict.confidence, verdict.n)
+    return f"{text}, about {test.cases_needed(verdict.n, verdict.failures, rate) - verdict.n:,} more are needed."
 
 
 def _needed_text(verdict: Verdict) -> str:
@@ -152,6 +168,9 @@ def combine_verdicts(
     undecided = "the requirement" if len(statuses) == 1 else undecided
     n_undecided = statuses.count(Status.INSUFFICIENT)
     undecided_text = f", {n_undecided} undecided" if n_undecided else ""
+    decided = "".join(
+        f" {verdict.requirement_id} is {verdict.status}." for verdict in verdicts if verdict.status.is_met
+    )
     remedy = find_remedy(verdicts, len(frame))
     remedy_text = f" {remedy.text}" if remedy.text else ""
     sentence = {
@@ -160,7 +179,7 @@ def combine_verdicts(
         Status.UNREGISTERED: f"{fraction} met, but no registered record shows the earlier runs.",
         Status.OTHER_CLAIMS: f"{fraction} met, after other claims about this campaign that did not pass.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {undecided}.{remedy_text}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {undecided}.{decided}{remedy_text}",
     }[worst]
     is_exploration = evidence is not None and evidence.kind is EvidenceKind.EXPLORATION
     additional_cases = remedy.cases if worst is Status.INSUFFICIENT and sampling.max_cases is None else None

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 from rich import box
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -24,9 +25,13 @@ _STYLES = {
 }
 
 
-def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Create a table of requirements with verdicts and evidence, for terminals of at least 80 columns."""
-    table = Table(title="Verdict", box=box.SIMPLE_HEAD, expand=False, title_justify="left", caption_justify="left")
+def verdict_table(verdicts: Sequence[Verdict], algorithm: str = "") -> Group:
+    """Create a table of requirements with verdicts and evidence, and its notes, for terminals of at least 80 columns.
+
+    algorithm: name of the algorithm under test
+    """
+    title = f"Verdict of {algorithm}" if algorithm else "Verdict"
+    table = Table(title=Text(title), box=box.SIMPLE_HEAD, expand=False, title_justify="left")
     table.add_column("Requirement", overflow="fold", ratio=None, min_width=18)
     table.add_column("Verdict", no_wrap=True)
     for heading in ("Failed", "Succeeded", "Bounds", "Needed"):
@@ -52,8 +57,8 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         lines.append(verdicts[0].note)
     else:
         lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
-    table.caption = Text("\n".join(lines), style="dim", justify="left")
-    return table
+    # not as the table's caption, which cuts off full lines
+    return Group(table, *(Text(line, style="dim") for line in lines))
 
 
 def confirmations_table(entries: Sequence[Confirmation]) -> Table:

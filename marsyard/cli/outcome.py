@@ -22,6 +22,7 @@ from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.looks import record_look
 from marsyard.reports.overall import multiplicity_text
+from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
@@ -44,7 +45,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     evaluation, page = evaluate_and_store(directory, requirements)
     run, verdicts = evaluation.run, evaluation.verdicts
     if not run.recorded("study"):
-        console.print(verdict_table(verdicts))
+        algorithms = read_algorithms(run.record)
+        console.print(verdict_table(verdicts, algorithms[0].name if algorithms else ""))
     for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
     lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]

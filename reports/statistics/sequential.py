@@ -100,11 +100,15 @@ class SequentialTest:
             min_events, max_events = (events, max_events) if is_supported else (min_events, events)
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - min_events, min_events + 1.0))))
 
-    def cases_needed(self, n: int, events: int) -> int:
-        """Return the total number of cases, at least n, that supports the verdict if no more events occur."""
+    def cases_needed(self, n: int, events: int, event_rate: float = 0.0) -> int:
+        """Return the total number of cases, at least n, that supports the verdict.
+
+        event_rate: fraction of the further cases that have an event, below `rate`; none by default
+        """
 
         def is_sufficient(cases: int) -> bool:
-            return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
+            expected = events + event_rate * (cases - n)
+            return bool(_log_likelihood_ratio(expected, cases, self.rate) >= self.log_threshold)
 
         upper = max(n, 1)
         while not is_sufficient(upper):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.overall import combine_verdicts, compute_exit_code
+from marsyard.reports.overall import combine_verdicts, compute_exit_code, find_remedy
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status
@@ -61,6 +61,17 @@ def test_metric_is_compared_by_magnitude_and_may_equal_the_bound(error: float | 
     frame = make_cases(5, 0).astype({"velocity_error_m_s": object})
     frame.loc[:1, "velocity_error_m_s"] = error
     assert evaluate(frame, VELOCITY).failures == failures
+
+
+def test_remedy_states_whether_more_cases_help_at_the_observed_rate() -> None:
+    texts = [
+        find_remedy(evaluate_requirements(make_cases(100, failures), [{**VELOCITY, "probability": 0.95}]), 100).text
+        for failures in (0, 2, 6)
+    ]
+    assert "rate so far" not in texts[0]
+    assert "continue at their rate so far (2.00 %), about " in texts[1]
+    assert texts[1].endswith(" more are needed.")
+    assert texts[2].endswith("(6.00 %), more cases are not expected to lead to PASS: it permits 5.00 %.")
 
 
 def test_populations_select_cases() -> None:

@@ -129,3 +129,15 @@ def test_number_of_cases_needed_is_the_minimum(first_cases: int, failures: int, 
 
     assert passes(cases_needed)
     assert cases_needed == max(first_cases, failures) or not passes(cases_needed - 1)
+
+
+def test_cases_needed_at_a_rate_of_events_support_the_verdict() -> None:
+    test, n, events = SequentialTest(0.05, 0.1, 259), 259, 9
+    total = test.cases_needed(n, events, events / n)
+
+    def lower_bound(cases: int) -> float:
+        failures = events / n * cases
+        return proportion_lower(cases - failures, cases, 1.0 - test.significance_level(cases))
+
+    assert lower_bound(total) >= 0.95 > lower_bound(int(0.98 * total))
+    assert test.cases_needed(n, events) < total
