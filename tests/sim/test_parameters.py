@@ -1,6 +1,6 @@
 """Tests of parameter tables: a table that changes some values of a preset keeps the other values of the preset."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -15,7 +15,7 @@ from marsyard.sim.parameters import merge_parameters
 from marsyard.sim.sensor import ImuParameters
 
 
-def _list_single_values(model: BaseModel) -> Iterator[dict[str, object]]:
+def _list_single_values(model: BaseModel) -> Iterator[Mapping[str, object]]:
     """List nested tables with one value of a model, the first number of each of its tables."""
     values = {name: getattr(model, name) for name in type(model).model_fields}
     numbers = [name for name, value in values.items() if isinstance(value, float | int)]
