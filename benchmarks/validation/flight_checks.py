@@ -69,7 +69,10 @@ PAIR_LIMITS = {"repeatability": (0.48, 0.62), "tracking_error_px": (0.3, 0.45), 
 FLOWN_PAIRS = {"repeatability": "0.54", "tracking_error_px": "0.39", "decorrelation": "0.020"}
 _NO_PAIR = PairStatistics(*[np.nan] * len(PairStatistics._fields))
 #: First seed of the compared terrains: parameters of the sites were set on other seeds.
-FIRST_SEED = 9500
+FIRST_SEED = 9900
+#: Number of terrains of the descent images. The median patchiness of 20 terrains has a standard deviation of 0.10 between
+#: sets of terrains (bootstrap), as much as its distance to the limits.
+_TERRAINS = 100
 
 
 def _render_descent(site: str, **values: float | int) -> Float64[np.ndarray, "rows columns"]:
@@ -100,7 +103,7 @@ def measure_within(claim: str, value: float, limits: tuple[float, float], how: s
 
 def compare_descent_images(quick: bool) -> Iterator[Measure]:
     """Compare descent images over Gusev with Spirit's, and the tails over Meridiani with those over Gusev."""
-    seeds = range(FIRST_SEED, FIRST_SEED + (3 if quick else 20))
+    seeds = range(FIRST_SEED, FIRST_SEED + (3 if quick else _TERRAINS))
     medians = {}
     for site in SUNS_DEG:
         rows = [

@@ -140,7 +140,7 @@ def render_hazard(site: str, seed: int) -> RenderedImage:
 
 def compare_ground_images(quick: bool) -> Iterator[Measure]:
     """Compare mast, hazard and helicopter images with those from Mars."""
-    seeds = range(FIRST_SEED, FIRST_SEED + (1 if quick else 5))
+    seeds = range(FIRST_SEED, FIRST_SEED + (1 if quick else 20))
     for site in ("gusev", "meridiani"):
         yield from _compare(
             [
