@@ -12,12 +12,13 @@ from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.outcomes_by_size import NO_FAULT, ExtraColumn, OutcomesBySize
+from marsyard.reports.presentation import AnswerFlags, system_presentation
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.statistics.error_summary import circular_error, error_ellipse
 from marsyard.reports.wording import NOTHING, format_fraction, interval, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
-from marsyard.scenarios.declared_columns import enabling_columns
+from marsyard.scenarios.declared_columns import enabling_columns, find_column
 
 
 def answers_section(subject: Subject) -> Section | None:
@@ -61,12 +62,28 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
         fractions[f"no {column.population.removeprefix('with ')} (of completed cases)"] = rates.fraction_of(
             ~is_enabled[is_completed], frame[is_completed]
         )
-    if subject.metric is not None and subject.bound is not None:
+    flags = _answer_flags(subject)
+    if flags is not None:
+        is_reported, is_wrong = (populations.flag_mask(frame, name) for name in (flags.reported, flags.wrong))
+        name = f"wrong answers: {_describe_flag(flags.wrong)} (of cases with a reported answer)"
+        fractions[name] = rates.fraction_of(is_wrong[is_reported], frame[is_reported])
+    elif subject.metric is not None and subject.bound is not None:
         has_error = _has_error(frame, subject.metric)
         is_wrong = ~populations.success_mask(frame[has_error], subject.metric, subject.bound)
         name = f"wrong answers: error above {subject.bound:g} {split_unit(subject.metric)[1]} (of answers)"
         fractions[name] = rates.fraction_of(is_wrong, frame[has_error])
     return fractions
+
+
+def _answer_flags(subject: Subject) -> AnswerFlags | None:
+    """Return the columns that classify the cases of the subject's system; None without a declaration."""
+    presentation = system_presentation(str(subject.run.recorded("scenario") or ""))
+    return None if presentation is None else presentation.answer_flags
+
+
+def _describe_flag(name: str) -> str:
+    column = find_column(name)
+    return name if column is None else column.meaning
 
 
 def _has_error(frame: pd.DataFrame, metric: str) -> Bool[np.ndarray, " n"]:
@@ -123,12 +140,18 @@ def scatter_section(subject: Subject) -> Section | None:
     )
 
 
-def _classify_answers(rows: pd.DataFrame, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers.
+def _classify_answers(
+    rows: pd.DataFrame, metric: str, bound: float, flags: AnswerFlags | None
+) -> dict[str, Bool[np.ndarray, " n"]]:
+    """Create the masks of correct answers (`valid`), cases without an answer (`invalid`) and wrong answers.
 
-    An answer without an error, for example one that came after the time of the metric, counts as no answer.
+    Without flags, answers within the bound are correct. An answer without an error, for example one that came after
+    the time of the metric, then counts as no answer.
     """
-    is_answered, is_correct = _has_error(rows, metric), populations.success_mask(rows, metric, bound)
+    if flags is not None:
+        is_answered, is_correct = populations.flag_mask(rows, flags.reported), ~populations.flag_mask(rows, flags.wrong)
+    else:
+        is_answered, is_correct = _has_error(rows, metric), populations.success_mask(rows, metric, bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 
@@ -140,16 +163,23 @@ def find_frequent_refusal(rows: pd.DataFrame) -> str:
     return str(refusals.index[0]) if len(refusals) else ""
 
 
-def fault_outcomes(metric: str, bound: float) -> OutcomesBySize:
+def fault_outcomes(metric: str, bound: float, flags: AnswerFlags | None = None) -> OutcomesBySize:
     """Define the outcomes of `_classify_answers` by fault and its size."""
+
+    def classify(rows: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
+        return _classify_answers(rows, metric, bound, flags)
+
     return OutcomesBySize(
-        outcomes=lambda rows: _classify_answers(rows, metric, bound),
+        outcomes=classify,
         styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
         cases="Cases",
         wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == NO_FAULT else f"{size:g}"),
         extra_columns=(
             ExtraColumn(
-                "Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING
+                "Most frequent refusal",
+                "most_frequent_refusal",
+                lambda rows: find_frequent_refusal(rows[classify(rows)["invalid"]]),
+                lambda text: text or NOTHING,
             ),
         ),
     )
@@ -159,8 +189,13 @@ def faults_section(subject: Subject) -> Section | None:
     """Create the section on outcomes by fault and size; None without faults or bound."""
     if subject.metric is None or subject.bound is None or not populations.is_flag(subject.frame, "answered"):
         return None
-    unit, confidence = split_unit(subject.metric)[1], format_fraction(CONFIDENCE)
-    note = note_text("common.faults", bound=f"{subject.bound:g}", unit=unit, confidence=confidence)
-    caption = "Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers."
-    blocks = fault_outcomes(subject.metric, subject.bound).blocks(subject.frame, "faults", caption, note)
+    flags = _answer_flags(subject)
+    if flags is not None:
+        valid, wrong = f"{_describe_flag(flags.reported)}, and none is wrong", _describe_flag(flags.wrong)
+    else:
+        valid = f"the case is answered within {subject.bound:g} {split_unit(subject.metric)[1]}"
+        wrong = "the case is answered with an error above the bound"
+    note = note_text("common.faults", valid=valid, wrong=wrong, confidence=format_fraction(CONFIDENCE))
+    caption = "Solid bars: correct answers. Hatched bars: no answer. Cross-hatched bars: wrong answers."
+    blocks = fault_outcomes(subject.metric, subject.bound, flags).blocks(subject.frame, "faults", caption, note)
     return create_section("faults", "Faults", "Faults by size", *blocks)

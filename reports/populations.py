@@ -64,9 +64,10 @@ def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
 def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     """Create the mask of a population, extended by the unfinished cases that would belong to it with a valid answer.
 
-    The populations `valid` and `completed` exclude unfinished cases; here only the other flags decide for such cases.
+    The populations `valid` (also under the name of its column, `answered`) and `completed` exclude unfinished cases;
+    here only the other flags decide for such cases.
     """
-    flags = [name for name in population.split(" and ") if name not in ("valid", "completed")]
+    flags = [name for name in population.split(" and ") if name not in ("valid", "answered", "completed")]
     return np.asarray(
         population_mask(frame, population) | (population_and_unknown_masks(frame, flags)[0] & engine_failed(frame))
     )

@@ -81,6 +81,18 @@ class Cause:
 
 
 @dataclass(frozen=True)
+class AnswerFlags:
+    """Columns that classify the cases of a system whose algorithms report several answers in a case.
+
+    - reported: flag of the cases with at least one reported answer
+    - wrong: flag of the cases in which at least one reported answer is wrong
+    """
+
+    reported: str
+    wrong: str
+
+
+@dataclass(frozen=True)
 class Presentation:
     """Report sections and case figures of a system.
 
@@ -88,6 +100,7 @@ class Presentation:
     - sections: functions that create sections after the sections common to all campaigns
     - first: functions that create sections before the common sections
     - outcomes: enumerations of outcomes; each value describes its outcome
+    - answer_flags: columns that classify the cases; None: the final answer and the page's metric classify them
     - explain: return the cause of a row's violation of a requirement with this metric; None if it is unknown. The row
       also contains the values of the campaign's file by parameter path, such as `lander.max_slope_deg`
     """
@@ -96,6 +109,7 @@ class Presentation:
     sections: Sequence[SectionMaker] = ()
     first: Sequence[SectionMaker] = ()
     outcomes: Sequence[type[Enum]] = ()
+    answer_flags: AnswerFlags | None = None
     explain: Callable[[Mapping[str, Any], str], Cause | None] | None = None
 
 

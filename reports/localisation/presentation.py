@@ -24,7 +24,7 @@ from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.effects import scatter_block
 from marsyard.reports.figure_style import INK, MUTED, REQUIREMENT, SERIES, in_page_style
 from marsyard.reports.images import Mark, Panel, draw_panels
-from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
+from marsyard.reports.presentation import AnswerFlags, CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, array_of_shape, read_arrays, to_matrix
 from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import Section, Subject, create_section, has_values
@@ -42,13 +42,13 @@ def _compute_coarse_rate(frame: pd.DataFrame) -> CaseFraction:
 
 
 _COARSE = Rate("coarse", f"Coarse position within {_MAX_COARSE_ERROR_M:g} m", _compute_coarse_rate)
-_FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+_FIXED_IN_TIME = Rate("fixed_in_time", "Last answer within 10 s is a position", flag_rate("fixed_in_time"))
 _FALSE_FIX = Rate(
     "false_fix", f"A reported position is wrong by more than {_MAX_POSITION_ERROR_M:g} m", flag_rate("false_fix")
 )
 _QUANTITIES = (
     Quantity("coarse_error_m", "horizontal error of the coarse position (m)"),
-    Quantity("position_error_at_10_s_m", "horizontal position error after 10 s (m)"),
+    Quantity("position_error_at_10_s_m", "horizontal position error of the last answer within 10 s (m)"),
     Quantity("position_error_m", "last horizontal position error (m)"),
     Quantity("position_error_up_m", "last error of the height (m)"),
     Quantity("velocity_error_m_s", "last velocity error (m/s)"),
@@ -60,7 +60,7 @@ _QUANTITIES = (
     Quantity("image_time_median_s", "processor time of an image (s, median)"),
 )
 _ERRORS = (
-    Quantity("position_error_at_10_s_m", "after 10 s"),
+    Quantity("position_error_at_10_s_m", "last answer within 10 s"),
     Quantity("position_error_m", "last"),
     Quantity("position_error_world_m", "last, relative to the world"),
 )
@@ -251,5 +251,6 @@ LOCALISATION = Presentation(
     first=(position_section,),
     sections=(light_section,),
     outcomes=(PositionOutcome,),
+    answer_flags=AnswerFlags(reported="position_reported", wrong="false_fix"),
     explain=explain,
 )

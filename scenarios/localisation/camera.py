@@ -19,6 +19,7 @@ from marsyard.sim.error_sources import CALIBRATION
 from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.presets import FLIGHT_RESIDUAL
 from marsyard.sim.sensor.radiometry import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath
 
 #: Distance of Mars from the sun at the landing on 2021-02-18: heliocentric longitude Ls = 5 deg on the orbit of Mars.
@@ -131,6 +132,7 @@ def _create_detector() -> DetectorParameters:
         bits=_BITS,
         temperature_c=0.0,
         dark_e_s=2000.0,
+        residual_spread=FLIGHT_RESIDUAL,
         optics=OpticsParameters(diffraction_px=light.diffraction_px(), diffusion_px=0.25),
     )
 
@@ -139,5 +141,6 @@ def _create_detector() -> DetectorParameters:
 #: delivered ones, each the sum of 2 x 2 pixels of the chip; the summation itself is not simulated. Assumed: read noise,
 #: offset, dark current (0.3 electrons in an exposure), readout, passband, blur; and the responsivity, which fills 60 %
 #: of the full well at the radiance factor 0.3 (the other presets' exposure). It is 35 % of that of an f/2.7 lens on a
-#: CCD of the same pitch: the rest is lost in the fill factor of a global shutter.
+#: CCD of the same pitch: the rest is lost in the fill factor of a global shutter. The pattern that the calibration
+#: lacks is that of Spirit's descent camera (assumed for this camera).
 LANDER_DETECTOR = _create_detector()

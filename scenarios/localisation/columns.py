@@ -11,8 +11,10 @@ COLUMNS = Columns(
         *common.CONTRAST,
         *common.ALGORITHM,
         *common.IMAGES,
-        condition("images", "number of images"),
-        condition("altitude_last_m", "true height above the ground at the last image", "altitude at the last image"),
+        condition("images", "number of delivered images"),
+        condition(
+            "altitude_last_m", "true height above the ground at the last delivered image", "altitude at the last image"
+        ),
         common.OFF_NADIR_MAX,
         common.ATTITUDE_RATE_MAX,
         condition("sun_difference_deg", "angle between the suns of map and landing"),
@@ -25,8 +27,8 @@ COLUMNS = Columns(
         flag("position_reported", "a position is reported", "with a reported position"),
         flag(
             "fixed_in_time",
-            "a position is reported within 10 s of the start",
-            "with a position reported within 10 s of the start",
+            "the last answer within 10 s of the start is a position",
+            "with a position as the last answer within 10 s of the start",
         ),
         outcome("fix_after_s", "time of the first reported position after the start"),
         outcome("valid_images", "images after which a position is reported"),
@@ -43,8 +45,8 @@ COLUMNS = Columns(
         ),
         error(
             "position_error_at_10_s_m",
-            "horizontal error of the last position reported within 10 s of the start",
-            "position error 10 s after the start",
+            "horizontal error of the last answer within 10 s of the start, at the time of this answer",
+            "position error of the last answer within 10 s of the start",
         ),
         error(
             "position_error_max_m",

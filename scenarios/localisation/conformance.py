@@ -11,7 +11,6 @@ lander descends at constant velocity and turns slowly, so that its inertial incr
 
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,7 +18,6 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.scenarios.conformance.checks import BreachError
 from marsyard.scenarios.conformance.estimators import StreamSuite, SuiteRules, Unusual, unusual_images
 from marsyard.scenarios.conformance.inputs import BLANKS, MEAN_RADIANCE, Blank, TexturedPlane, texture
 from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
@@ -45,8 +43,6 @@ _TEXTURE_STEP_M, _MAP_PIXEL_M, _MAP_PX = 12.0, 6.0, 640
 _MEAN_DN, _OFFSET_DN, _FULL_SCALE_DN = 110.0, 2.0, 255
 #: Jitter of the time tags: images and altitudes, s; inertial data, as a fraction of the interval.
 _TAG_JITTER_S, _IMU_JITTER = 0.005, 0.4
-#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.
-_TIME_TOLERANCE_S = 1e-6
 #: Index of a boundary of the increments whose tag is equal to the next one.
 _EQUAL_TAG = 50
 
@@ -144,20 +140,6 @@ def _map() -> MapProduct:
     return MapProduct(appearance, np.zeros_like(appearance), np.full(2, offsets[0]), _MAP_PIXEL_M, 1.0, 1.0, 1.0)
 
 
-def check_answers(answer: Any, measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
-    """Return the answers to a descent if they are valid, and have the time tags of their images.
-
-    Raises AlgorithmError for an invalid answer, and BreachError for another time.
-    """
-    answers = measurements.check(answer)
-    tags_s = [*sorted(image.time_s for image in measurements.images), float(measurements.increments.times_s[-1])]
-    for number, (estimate, tag_s) in enumerate(zip(answers.estimates, tags_s, strict=True), start=1):
-        if abs(estimate.time_s - tag_s) > _TIME_TOLERANCE_S:
-            name = f"image {number}" if number < len(tags_s) else "finish"
-            raise BreachError(f"the time_s of its answer to {name} is {estimate.time_s} s; expected {tag_s} s")
-    return answers
-
-
 def describe_answers(answers: StreamAnswers[PositionEstimate]) -> str:
     """Return the number of positions, and the outcome or the horizontal error at the end."""
     valid = sum(estimate.outcome is PositionOutcome.VALID for estimate in answers.after_images)
@@ -172,7 +154,7 @@ def describe_answers(answers: StreamAnswers[PositionEstimate]) -> str:
 #: The descents of the suite, and the rules for their answers.
 POSITION = SuiteRules(
     measurements=ordinary_descent,
-    check=check_answers,
+    check=lambda answer, measurements: measurements.check(answer),
     is_valid=lambda answers: answers.outcome is PositionOutcome.VALID,
     describe=describe_answers,
     failures=", ".join(outcome.name for outcome in PositionOutcome if outcome is not PositionOutcome.VALID),

@@ -18,6 +18,7 @@ from marsyard.scenarios.condition_columns import attitude_rate_deg_s, contrast_c
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.localisation.map_truth import MapTruth
 from marsyard.scenarios.localisation.simulation import LocalisedDescent
+from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.radiance import sun_at
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
@@ -96,7 +97,7 @@ def _true_state(descent: LocalisedDescent, tag_s: float) -> State:
 
 def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
     """Return the columns of a case that do not depend on an algorithm."""
-    p, world, states = descent.p, descent.world, descent.states
+    p, world, states = descent.p, descent.world, descent.image_states
     map_sun = sun_at(world.air, p.map.sun_azimuth_deg, p.map.sun_elevation_deg)
     cosine = float(np.clip(map_sun.direction @ world.sun.direction, -1.0, 1.0))
     initial, shift = descent.measurements.initial, descent.map_truth.shift_m
@@ -112,11 +113,16 @@ def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
         "map_shift_m": float(np.hypot(*shift)),
         "initial_error_m": float(np.hypot(*(initial.position_m[:2] - reference))),
         "initial_attitude_error_deg": attitude_error_deg(initial.world_from_body, descent.initial_truth),
-        "off_nadir_max_deg": max(off_nadir_deg(state) for state in states),
-        "attitude_rate_max_deg_s": max(attitude_rate_deg_s(state) for state in states),
-        "altitude_last_m": float(states[-1].position_m[2] - world.surface.height(*states[-1].position_m[:2])),
+        "off_nadir_max_deg": max(map(off_nadir_deg, states), default=np.nan),
+        "attitude_rate_max_deg_s": max(map(attitude_rate_deg_s, states), default=np.nan),
+        "altitude_last_m": _altitude_m(world, states[-1]) if states else np.nan,
         **p.faults.columns,
     }
+
+
+def _altitude_m(world: LocalisationWorld, state: State) -> float:
+    """Return the true height above the ground."""
+    return float(state.position_m[2] - world.surface.height(*state.position_m[:2]))
 
 
 def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[str, Scalar]:
@@ -124,7 +130,8 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimat
     errors = compute_errors(descent, answers)
     valid = [error for error in errors if error is not None]
     final = errors[-1]
-    early = [error for error in valid if error.time_s <= REQUIRED_S]
+    early = [error for estimate, error in zip(answers.estimates, errors, strict=True) if estimate.time_s <= REQUIRED_S]
+    at_10_s = early[-1] if early else None
     times_s = answers.image_times_s
     details = [estimate.details for estimate in answers.after_images]
     inliers = [item.inliers for item in details if isinstance(item, LocalisationDetails) and item.inliers is not None]
@@ -137,9 +144,9 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimat
     return {
         "coarse_error_m": _coarse_error_m(descent, *coarse[0]) if coarse else np.nan,
         "fix_after_s": valid[0].time_s if valid else np.nan,
-        "fixed_in_time": bool(early),
+        "fixed_in_time": at_10_s is not None,
         "position_reported": bool(valid),
-        "position_error_at_10_s_m": early[-1].horizontal_m if early else np.nan,
+        "position_error_at_10_s_m": np.nan if at_10_s is None else at_10_s.horizontal_m,
         "position_error_m": np.nan if final is None else final.horizontal_m,
         "position_error_max_m": max(horizontal, default=np.nan),
         "false_fix": any(error > REQUIRED_M for error in horizontal),

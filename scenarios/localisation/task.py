@@ -55,8 +55,8 @@ def _join(estimates: Sequence[PositionEstimate]) -> StreamAnswers[PositionEstima
 
 def _create_refusals(measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
     """Create the refusals that a run returns if it only exports the measurements: it produces no estimates."""
-    refusal = PositionEstimate(PositionOutcome.NO_COARSE_FIX, float(measurements.increments.times_s[-1]))
-    return StreamAnswers((refusal,) * len(measurements.images), refusal)
+    refusals = [PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s) for time_s in measurements.answer_times_s]
+    return StreamAnswers(tuple(refusals[:-1]), refusals[-1])
 
 
 #: Format of a table of answers; the answer to a case is `StreamAnswers`.

@@ -103,7 +103,7 @@ def _create_mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **
 
 
 #: RMS of the pattern in the flown descent camera's images that its calibration lacks.
-_FLIGHT_RESIDUAL = 0.01
+FLIGHT_RESIDUAL = 0.01
 #: MER descent camera: focal length 14.67 mm, pixel pitch 12 um.
 _DESCENT = CameraDesign(focal_length_mm=14.67, pixel_pitch_um=12.0, size=(1024, 1024), radial=NAVCAM_RADIAL, down=True)
 #: F-number of the MER descent camera and navcam, and of the hazcam (Maki et al. 2003).
@@ -125,7 +125,7 @@ def _descent_light(neutral_density: float) -> LightPath:
 def _create_mer_descent_flown() -> Preset:
     light = _descent_light(neutral_density=NG4_FLIGHT)
     # the pattern is calibrated: pairs of rendered images differ as much as pairs of Spirit's
-    changes = {"exposure_s": _FLIGHT_EXPOSURE_S, "temperature_c": -34.0, "residual_spread": _FLIGHT_RESIDUAL}
+    changes = {"exposure_s": _FLIGHT_EXPOSURE_S, "temperature_c": -34.0, "residual_spread": FLIGHT_RESIDUAL}
     return _create_mer_preset(_DESCENT, light, MARS_AU, **changes)
 
 

@@ -62,7 +62,7 @@ def test_values_called_calibrated_in_the_code_are_registered() -> None:
     # the constants that comments and pages call calibrated or fitted
     names = {constant.name for constant in read_register()}
     assert names >= {
-        "LENS_TRANSMISSION", "DARK_E_S", "_FLIGHT_RESIDUAL", "residual_px", "crater_sand_log_albedo",
+        "LENS_TRANSMISSION", "DARK_E_S", "FLIGHT_RESIDUAL", "residual_px", "crater_sand_log_albedo",
         "crater_ejecta_contrast", "relief_log_albedo", "crest_length", "regularity", "cover", "wind_east_m_s",
         "change_k", "averaging_after_s",
     }  # fmt: skip

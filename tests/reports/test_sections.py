@@ -142,6 +142,34 @@ def test_late_answers_are_not_wrong_and_crashed_cases_are() -> None:
     assert (row["valid"], row["invalid"], row["wrong"]) == (5, 3, 2)
 
 
+def test_false_fixes_are_wrong_answers_whatever_is_reported_later() -> None:
+    """100 descents: 30 withdraw a wrong position, and refuse at the end; 20 are right at 10 s and wrong at the end."""
+    number = np.arange(100)
+    frame = pd.DataFrame(
+        {
+            "fault": "haze",
+            "fault_size": 1.0,
+            "answered": number >= 30,
+            "outcome": np.where(number < 30, "INCONSISTENT", "VALID"),
+            "position_reported": True,
+            "false_fix": number < 50,
+            "position_error_at_10_s_m": np.where(number < 30, 300.0, 5.0),
+        }
+    )
+    # three crashed cases, without flags
+    crashed = pd.DataFrame({"fault": ["haze"] * 3, "fault_size": 1.0, "answered": False, "outcome": "CRASHED"})
+    frame = pd.concat([frame, crashed], ignore_index=True)
+    run = StoredRun(Path("run"), frame, frame, {"scenario": "localisation"}, ())
+    subject = Subject(run, "position_error_at_10_s_m", 40.0)
+    name, wrong = list(answer_fractions(subject).items())[-1]
+    assert name.startswith("wrong answers: a reported position is more than 40 m from the true one (of cases")
+    assert (wrong.hits, wrong.n) == (50, 100)
+    counts, table = faults_section(subject).blocks
+    (row,) = counts.data["rows"]
+    assert (row["valid"], row["invalid"], row["wrong"], row["most_frequent_refusal"]) == (50, 3, 50, "CRASHED")
+    assert "Valid: a position is reported, and none is wrong." in table.note
+
+
 def test_faults_are_grouped_by_kind_and_size() -> None:
     frame = pd.DataFrame(
         {

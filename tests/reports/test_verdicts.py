@@ -173,7 +173,7 @@ def test_crashed_case_with_a_small_error_fails() -> None:
     assert evaluate(frame, requirement, population="all", decide_by="estimate").failures == 2
 
 
-@pytest.mark.parametrize("population", ["valid", "completed", "valid and is_near"])
+@pytest.mark.parametrize("population", ["valid", "answered", "completed", "valid and is_near"])
 def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) -> None:
     """The verdict is INSUFFICIENT if it depends on whether crashed cases belong to the population."""
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}

@@ -12,7 +12,6 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.exchange import check_estimate
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 
-SPAN_S = (-0.2, 40.0)  #: First and last time of the inertial increments.
 #: Fields of the state, which a valid answer contains and a refusal does not.
 STATE_FIELDS = ("position_m", "velocity_m_s", "world_from_body", "covariance")
 
@@ -35,7 +34,7 @@ class _Malformed(PositionEstimate):
 def _expect_bad(answer: object, message: str) -> None:
     """Assert that the answer raises BAD_ANSWER with this message on one line."""
     with pytest.raises(AlgorithmError, match=message) as caught:
-        check_estimate(answer, SPAN_S)
+        check_estimate(answer)
     assert caught.value.fault is Fault.BAD_ANSWER
     assert "\n" not in str(caught.value)
 
@@ -50,9 +49,9 @@ def test_outcome_of_another_type_is_refused(outcome: object) -> None:
     _expect_bad(_Malformed(outcome=outcome), rf"outcome is a {type(outcome).__name__}; allowed: a PositionOutcome")
 
 
-@pytest.mark.parametrize("time_s", [-0.21, 40.1, np.nan, np.inf, None, "12.5", np.array(12.5)])
-def test_time_outside_of_the_increments_is_refused(time_s: object) -> None:
-    _expect_bad(_Malformed(time_s=time_s), r"time_s is .*; allowed: -0.2 to 40.0")
+@pytest.mark.parametrize("time_s", [np.nan, np.inf, None, "12.5", np.array(12.5)])
+def test_time_that_is_no_number_is_refused(time_s: object) -> None:
+    _expect_bad(_Malformed(time_s=time_s), r"time_s is .*; allowed: a finite number")
 
 
 @pytest.mark.parametrize("name", STATE_FIELDS)
@@ -91,11 +90,11 @@ def test_malformed_state_is_refused(name: str, value: object, message: str) -> N
     _expect_bad(_Malformed(**{name: value}), message)
 
 
-@pytest.mark.parametrize("time_s", [SPAN_S[0], 12.5, SPAN_S[1], 3])
+@pytest.mark.parametrize("time_s", [-0.2, 12.5, 3])
 def test_valid_answer_is_copied(time_s: float) -> None:
-    """Both ends of the span are allowed; a later change of the algorithm's arrays does not change the copy."""
+    """A later change of the algorithm's arrays does not change the copy."""
     answer = replace(_make_valid(), time_s=float(time_s))
-    checked = check_estimate(answer, SPAN_S)
+    checked = check_estimate(answer)
     assert checked.outcome is PositionOutcome.VALID
     assert checked.details == "d"
     assert type(checked.time_s) is float
@@ -110,13 +109,13 @@ def test_valid_answer_is_copied(time_s: float) -> None:
 
 
 def test_single_precision_is_converted() -> None:
-    checked = check_estimate(_Malformed(position_m=np.array([1.0, 2.0, 3.0], dtype=np.float32)), SPAN_S)
+    checked = check_estimate(_Malformed(position_m=np.array([1.0, 2.0, 3.0], dtype=np.float32)))
     assert checked.position_m.dtype == np.float64
 
 
 @pytest.mark.parametrize("outcome", [outcome for outcome in PositionOutcome if outcome is not PositionOutcome.VALID])
 def test_refusal_without_a_state_is_valid(outcome: PositionOutcome) -> None:
     answer = PositionEstimate(outcome, 2.0, details=("diagnosis",))
-    checked = check_estimate(answer, SPAN_S)
+    checked = check_estimate(answer)
     assert checked == answer
     assert checked is not answer

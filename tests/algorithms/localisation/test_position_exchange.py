@@ -154,7 +154,9 @@ for line in sys.stdin:
     if request["do"] == "start":
         actions.clear()
     actions.append(request["do"])
-    answer = ANSWER if request["do"] in ("process_image", "finish") else {"outcome": None}
+    answer = {"outcome": None}
+    if request["do"] in ("process_image", "finish"):
+        answer = {**ANSWER, "time_s": 0.5 if request["do"] == "process_image" else 1.0}
     # BODY
     print(json.dumps({"exchange": 3, "id": request["id"], **answer}), flush=True)
 """
@@ -185,7 +187,7 @@ def test_process_answers_one_descent_or_many_in_order_of_messages(tmp_path: Path
 
 
 #: A line for `PLAIN` that makes the answers to image and finish valid.
-VALID = 'answer = {**STATE, "outcome": "VALID", "time_s": 0.5} if "outcome" in answer and answer["outcome"] else answer'
+VALID = 'answer = {**answer, **STATE, "outcome": "VALID"} if "outcome" in answer and answer["outcome"] else answer'
 
 
 IF_IMAGE = "if request['do'] == 'process_image': "
@@ -202,7 +204,11 @@ IF_IMAGE = "if request['do'] == 'process_image': "
         ("if request['do'] == 'process_increments': answer = {}", Fault.BAD_ANSWER, "None; .* allowed: null"),
         (f"{IF_IMAGE}answer = {{'outcome': None}}", Fault.BAD_ANSWER, "is a NoneType; allowed: a Posi"),
         (f"{IF_IMAGE}answer = {{'outcome': 'UNCERTAIN'}}", Fault.BAD_ANSWER, "time_s is missing"),
-        (f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': -1.0}}", Fault.BAD_ANSWER, "time_s is -1.0; allowed: 0.0 to 1.0"),
+        (
+            f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': -1.0}}",
+            Fault.BAD_ANSWER,
+            "answer to image 1 is -1.0 s; allowed: 0.5 s, its time tag",
+        ),
         (f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': float('nan')}}", Fault.BAD_ANSWER, "time_s is 'NaN'; allowed"),
         (f"{IF_IMAGE}answer = {{**ANSWER, 'position': 1}}", Fault.BAD_ANSWER, "unknown key 'position'"),
         (f"{IF_IMAGE}answer = {{**ANSWER, 'outcome': 'VALID'}}", Fault.BAD_ANSWER, "VALID, but position_m is missing"),

@@ -22,7 +22,7 @@ BOUNDS = {
     "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,
     "VTT-DRIFT": 2.5,
     "HDA-SAFE": None, "HDA-TOUCHDOWN": None, "HDA-FIND": None, "HDA-FAR": None, "HDA-MAP": 0.9, "HDA-POS": 1.21,
-    "LOC-POS": 40.0, "LOC-FINAL": 40.0, "LOC-HARM": 40.0, "LOC-COARSE": 200.0, "LOC-AVAIL": None,
+    "LOC-POS": 40.0, "LOC-FINAL": 40.0, "LOC-HARM": 40.0, "LOC-COARSE": 200.0, "LOC-AVAIL": None, "LOC-END": None,
 }  # fmt: skip
 
 

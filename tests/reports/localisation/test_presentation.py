@@ -36,7 +36,7 @@ from tests.reports.localisation.synthetic_localisation import (
 
 REQUIREMENT = {
     "id": "LOC-FINAL", "statement": "The last position is within 40 m.", "metric": "position_error_m", "bound": 40.0,
-    "probability": 0.9, "confidence": 0.9, "population": "answered",
+    "probability": 0.9, "confidence": 0.9, "population": "valid",
 }  # fmt: skip
 
 
@@ -170,7 +170,7 @@ def test_position_section_has_rates_and_quantiles() -> None:
     frame = localisation_frame(200)
     section = position_section(_make_subject(frame))
     rates = section.data["rates"]
-    assert rates["Position reported within 10 s"].hits == frame["fixed_in_time"].sum()
+    assert rates["Last answer within 10 s is a position"].hits == frame["fixed_in_time"].sum()
     assert rates["Coarse position within 200 m"].hits == frame["fixed_in_time"].sum()
     assert rates["A reported position is wrong by more than 40 m"].hits == 0
     headings = [block.heading for block in section.blocks]

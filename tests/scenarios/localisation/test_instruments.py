@@ -16,6 +16,7 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.initial_state import InitialErrors
 from marsyard.scenarios.localisation.instruments import RADAR, measure_altitudes
 from marsyard.sim.sensor import Detector, RadarAltimeter
+from marsyard.sim.sensor.presets import preset
 from marsyard.sim.terrain import Surface
 
 #: Height of the level ground, and gravity of Mars.
@@ -80,7 +81,7 @@ def test_calibration_errors_have_their_standard_deviation(changes: dict[str, flo
 
 def test_detector_has_the_specified_signal_to_noise_ratio() -> None:
     """Two images of a uniform scene at half of the full well: their difference has sqrt(2) times the noise."""
-    detector = LANDER_DETECTOR.model_copy(update={"response_spread": 0.0})
+    detector = LANDER_DETECTOR.model_copy(update={"response_spread": 0.0, "residual_spread": 0.0})
     radiance = 0.5 * detector.full_well_e / (detector.responsivity_e_s * detector.exposure_s)
     rng = np.random.default_rng(5)
     unit = Detector.draw(np.ones((256, 256), dtype=np.float32), detector, rng)
@@ -93,6 +94,21 @@ def test_detector_has_the_specified_signal_to_noise_ratio() -> None:
     assert (first.mean() - detector.offset_dn) / noise == pytest.approx(HALF_WELL_SNR, rel=0.02)
     assert unit.calibration.full_scale_dn == 255
     assert detector.exposure_s == 150e-6
+
+
+def test_images_contain_the_pattern_of_the_flown_descent_camera() -> None:
+    """The response contains a pattern with the RMS of that of Spirit's camera, which the calibration lacks."""
+    flown = preset("mer-descent-flown").detector
+    assert LANDER_DETECTOR.residual_spread == flown.residual_spread > 0.0
+    assert LANDER_DETECTOR.residual_px == flown.residual_px
+    exact = LANDER_DETECTOR.model_copy(update={"response_spread": 0.0, "calibration_error": 0.0})
+    radiance = np.full((256, 256), 0.5 * exact.full_well_e / (exact.responsivity_e_s * exact.exposure_s), np.float32)
+    unit = Detector.draw(np.ones((256, 256), dtype=np.float32), exact, np.random.default_rng(5))
+    rng = np.random.default_rng(6)
+    mean = np.mean([unit.expose(radiance, rng) for _ in range(100)], axis=0) - exact.offset_dn
+    # the noise of a mean of 100 images is 0.1 / 80 = 0.13 %; the calibrated response is normalised to its maximum
+    pattern = mean / unit.calibration.flat_field
+    assert pattern.std() / pattern.mean() == pytest.approx(flown.residual_spread, rel=0.1)
 
 
 def test_radar_measures_the_altitude_over_flat_ground(flight: LanderFlight) -> None:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.baselines import InertialEstimator
-from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import IMAGE_CLOCK
@@ -124,6 +125,34 @@ def test_measurements_outside_of_the_increments_are_first_or_last(increments: Im
     batches = [event for event in events if isinstance(event, ImuIncrements)]
     assert [batch.times_s[0] for batch in batches] == [increments.times_s[0], batches[0].times_s[-1]]
     assert batches[-1].times_s[-1] == increments.times_s[-1]
+
+
+@pytest.mark.parametrize(
+    ("answer", "error_s", "message"),
+    [
+        (0, 1e-5, r"answer to image 1 is 1.00001 s; allowed: 1.0 s, its time tag"),
+        (1, -1.0, r"answer to image 2 is 2.0 s; allowed: 3.0 s"),
+        # a state of the descent, reported after its end
+        (3, -2.0, r"answer to finish is .*; allowed: .* the last increment"),
+    ],
+)
+def test_answer_with_another_time_is_bad(increments: ImuIncrements, answer: int, error_s: float, message: str) -> None:
+    """The third image is tagged after the inertial data; its answer has the time of the last increment."""
+    images = tuple(_make_image(tag) for tag in (3.0, 6.5, 1.0))
+    measurements = LocalisationMeasurements(INITIAL, MAP, increments, (), images)
+    last_s = float(increments.times_s[-1])
+    times_s = np.array([1.0, 3.0, last_s, last_s])
+    assert measurements.answer_times_s == tuple(times_s)
+
+    def check(times_s: np.ndarray) -> None:
+        estimates = [PositionEstimate(PositionOutcome.UNCERTAIN, float(time_s)) for time_s in times_s]
+        measurements.check(StreamAnswers(tuple(estimates[:-1]), estimates[-1]))
+
+    # less than the tolerance of 1 us
+    check(times_s + 5e-7)
+    with pytest.raises(AlgorithmError, match=message) as caught:
+        check(times_s + error_s * (np.arange(4) == answer))
+    assert caught.value.fault is Fault.BAD_ANSWER
 
 
 def test_images_follow_the_schedule(flight: LanderFlight) -> None:

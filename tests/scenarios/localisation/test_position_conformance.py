@@ -57,9 +57,13 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
         (
             "answer",
             "def process_image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 0.5)",
-            "the time_s of its answer to image 1 is 1.5 s; expected 1.0 s",
+            "BAD_ANSWER: time_s of the answer to image 1 is 1.5 s; allowed: 1.0 s, its time tag",
         ),
-        ("answer", "def finish(self): return PositionEstimate(Outcome.UNCERTAIN, 99.0)", "time_s is 99.0; allowed"),
+        (
+            "answer",
+            "def finish(self): return PositionEstimate(Outcome.UNCERTAIN, 99.0)",
+            "answer to finish is 99.0 s; allowed: 8.0",
+        ),
         ("answer", "def process_image(self, image): image.counts[:] = 0", "it raised ValueError"),
         ("black", "def process_image(self, image): return 1 // int(image.counts.max())", "it raised ZeroDivisionError"),
         ("saturated", "def process_image(self, image): assert image.counts.min() < 255", "it raised AssertionError"),

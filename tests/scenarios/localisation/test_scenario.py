@@ -14,10 +14,11 @@ from pydantic import ValidationError
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
-from marsyard.scenarios.condition_columns import contrast_columns
+from marsyard.scenarios.condition_columns import contrast_columns, off_nadir_deg
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisationScenario
+from marsyard.scenarios.localisation.score import conditions
 from marsyard.scenarios.localisation.simulation import INERTIAL_LEAD_S, LocalisedDescent
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.measurements import ImuIncrements
@@ -139,11 +140,18 @@ def test_lost_images_are_missing_in_the_measurements() -> None:
     counts = {image.time_s: image.counts for image in complete.images}
     for image in half.images:
         np.testing.assert_array_equal(image.counts, counts[image.time_s])
+    # conditions are those of the delivered images
+    flights = half.image_states
+    assert flights != half.states
+    assert conditions(half)["off_nadir_max_deg"] == max(map(off_nadir_deg, flights))
+    last_m = flights[-1].position_m
+    assert conditions(half)["altitude_last_m"] == last_m[2] - half.world.surface.height(*last_m[:2])
     result = _run(faults={"lost_images": 1.0}, **COARSE)
     row: Any = result.row
     assert (result.outcome, result.answered, result.failure) == ("NO_COARSE_FIX", False, None)
     assert (row["images"], row["valid_images"], row["fixed_in_time"], row["false_fix"]) == (0, 0, False, False)
     assert np.isnan(row["position_error_m"])
+    assert np.isnan([row[name] for name in ("altitude_last_m", "off_nadir_max_deg", "attitude_rate_max_deg_s")]).all()
     assert np.isnan(row["inliers_min"])
     assert result.products["track"].shape == (1, 7)
 
@@ -316,7 +324,7 @@ def test_late_answer_is_a_bad_answer() -> None:
     """The answer of an estimator is validated: a wrong one is the outcome of the case, with the reason."""
     result = _run(algorithm="tests.scenarios.localisation.test_scenario:LateEstimator", **COARSE)
     assert result.outcome == "BAD_ANSWER"
-    assert "time_s is 1000000.0; allowed" in result.failure.error
+    assert "answer to image 1 is 1000000.0 s; allowed: 0.5" in result.failure.error
     assert result.row["images"] == 4
     assert "position_error_m" not in result.row
 

@@ -204,6 +204,16 @@ def test_first_position_after_10_s_is_late() -> None:
     assert in_time["position_error_at_10_s_m"] == pytest.approx(1.0)
 
 
+def test_position_that_is_withdrawn_before_10_s_is_not_available() -> None:
+    withdrawn = _row(_estimate(2.0, [1.0, 0.0, 0.0]), _refusal(6.0), _estimate(14.0, [2.0, 0.0, 0.0]))
+    assert (withdrawn["fixed_in_time"], withdrawn["position_reported"]) == (False, True)
+    assert np.isnan(withdrawn["position_error_at_10_s_m"])
+    assert withdrawn["fix_after_s"] == pytest.approx(2.5)
+    restored = _row(_estimate(2.0, [1.0, 0.0, 0.0]), _refusal(6.0), _estimate(9.4, [2.0, 0.0, 0.0]), _refusal(END_S))
+    assert restored["fixed_in_time"] is True
+    assert restored["position_error_at_10_s_m"] == pytest.approx(2.0)
+
+
 def test_row_of_refusals_has_nan_errors() -> None:
     row = _row(_refusal(2.0), _refusal(6.0), _refusal(END_S))
     assert (row["fixed_in_time"], row["false_fix"], row["valid_images"]) == (False, False, 0)
