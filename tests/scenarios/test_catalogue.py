@@ -108,7 +108,7 @@ def test_no_verdict_depends_on_the_run_time_of_the_host(name: str) -> None:
 
 def test_disparity_errors_of_table_1_are_normal_with_a_three_sigma_error_of_1_px() -> None:
     campaign = load_campaign("vtt-accuracy")
-    assert _read_parameters("vtt-accuracy")["stereo"]["disparity_error_px"] == 0.0
+    assert campaign.parameters(0).model_dump()["stereo"]["disparity_error_px"] == 0.0
     errors_px = np.array([campaign.draws(case)["stereo.disparity_offset_px"] for case in range(1000)])
     # tolerances: four standard errors of the rms, and of the fraction beyond 2 sigma, which is 4.55 %
     assert np.sqrt(np.mean(errors_px**2)) == pytest.approx(1.0 / 3.0, abs=4.0 / 3.0 / np.sqrt(2000.0))
