@@ -8,10 +8,12 @@ these measurements by the truth with errors, which is faster and isolates the ca
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.navigation.planner import NavigationOutcome
 from marsyard.algorithms.navigation.visual_odometry import MotionEstimate, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.scenarios.rover.designation import designate_from_start
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
@@ -85,9 +87,41 @@ def drive_legs(p: RoverScenarioParameters, run: RoverRun, guide: Guide) -> RunOu
         while failure is None and not is_finished(leg, step_count, guide.target(run)):
             failure = drive_step(p, run, leg, step_count, guide.target(run)) or visit_stop(p, run, guide, number)
             # a loss at this stop remains a failure of the tracker
-            failure = failure or (RunOutcome.STUCK if is_stuck(run.steps, p.mobility) else None)
+            failure = failure or (RunOutcome.STUCK if ends_stuck(p, run) else None)
             step_count += 1
     return failure
+
+
+def ends_stuck(p: RoverScenarioParameters, run: RoverRun) -> bool:
+    """Whether a stuck rover ends the run; not before `mobility.stuck_steps` steps."""
+    return len(run.steps) >= p.mobility.stuck_steps and is_stuck(run.steps, p.mobility)
+
+
+def drive_commanded_path(p: RoverScenarioParameters, run: RoverRun) -> list[RigidTransform]:
+    """Drive a prepared run of commanded legs without a tracker and images; return the true poses of the mast's head.
+
+    At all stops the mast points at the designated point.
+    """
+    # without rendered images of visual odometry, which do not change the true path
+    p = p.model_copy(update={"navigation": p.navigation.model_copy(update={"odometry": "oracle-motion"})})
+    rig, vehicle, heads = run.setup.rig, run.setup.vehicle, []
+
+    def add_stop() -> TargetEstimate:
+        target = run.create_target_estimate(vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy()))
+        angles = mast_angles(target.position_rover, rig.calibrated, p.vtt.aim_pair)
+        if angles is not None:
+            rig.point(*angles)
+        heads.append(compose(vehicle.stance.world_from_rover, rig.rover_from_head))
+        return target
+
+    target = add_stop()
+    for leg in p.legs:
+        for step_count in range(leg.steps):
+            drive_step(p, run, leg, step_count, target)
+            target = add_stop()
+            if ends_stuck(p, run):
+                return heads
+    return heads
 
 
 def visit_stop(p: RoverScenarioParameters, run: RoverRun, guide: Guide, leg: int) -> RunOutcome | None:
@@ -124,7 +158,7 @@ def drive_step(
         if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
             return RunOutcome.NO_PATH
         commands = plan.commands
-    start, commanded_m = run.setup.vehicle.stance, 0.0
+    drives: list[Drive] = []
     for command in commands:
         part_count = 1
         if leg.visual_odometry:
@@ -133,12 +167,12 @@ def drive_step(
             part_count = max(1, int(np.ceil(parts - 1e-9)))
             run.visual_odometry_updates += part_count
             run.time_s += part_count * p.timing.visual_odometry_s
-        run.drives_since_stop += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
+        drives += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
         run.time_s += p.timing.drive_s
-        commanded_m += command.length_m
-    if commanded_m > 0.0:
-        ends = (stance.world_from_rover.translation for stance in (start, run.setup.vehicle.stance))
-        run.steps.append(Step(commanded_m, float(np.linalg.norm(np.subtract(*ends)))))
+    run.drives_since_stop += drives
+    step = Step.from_drives(drives)
+    if step.commanded_m > 0.0:
+        run.steps.append(step)
     return None
 
 

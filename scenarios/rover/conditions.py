@@ -16,7 +16,7 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Vector, rover_shades_patch, sample_template
 from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.run_state import RoverRun, StopView
-from marsyard.scenarios.rover.score import errors_px, finite_max
+from marsyard.scenarios.rover.score import errors_px, known_max
 from marsyard.scenarios.rover.world import RunWorld
 
 
@@ -104,17 +104,17 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
     return {
         "range_start_m": ranges[0],
         "range_end_m": ranges[1],
-        "max_tilt_deg": float(np.degrees(finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
+        "max_tilt_deg": float(np.degrees(known_max(np.array([stop.stance.tilt_rad for stop in stops])))),
         "distance_driven_m": distance,
         "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
-        "slip_max": finite_max(slips) if np.any(is_moving) else 0.0,
+        "slip_max": known_max(slips) if np.any(is_moving) else 0.0,
         "pose_error_m": pose_error,
         "pose_error_fraction": pose_error / distance if distance > 0.0 else np.nan,
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
-        "min_exposure_s": -finite_max(-exposures),  # minimum of the finite values
-        "max_exposure_s": finite_max(exposures),
+        "min_exposure_s": -known_max(-exposures),  # minimum of the known values
+        "max_exposure_s": known_max(exposures),
     }
 
 
@@ -129,11 +129,19 @@ def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, S
         obliquity = {"obliquity_start_deg": np.nan, "obliquity_max_deg": np.nan}
         return {"point_in_view": True, **obliquity, **shadow_columns(p, run, [])}
     heads = [stop.world_from_head for stop in run.stops]
-    columns = asdict(evaluate_visibility(run.setup.world, run.setup.rig, run.target.point_world, heads, p.vtt))
+    visibility = path_visibility(p, run, heads)
     # NaN (not tracked) is an error, too
     errors = np.nan_to_num(np.hypot(*errors_px(run).T), nan=np.inf) > p.score.false_track_px
     end = int(np.argmax(errors)) + 1 if np.any(errors) else len(run.stops)
-    return {"point_in_view": columns.pop("in_view"), **columns, **shadow_columns(p, run, run.stops[:end])}
+    return {**visibility, **shadow_columns(p, run, run.stops[:end])}
+
+
+def path_visibility(p: RoverScenarioParameters, run: RoverRun, heads: Sequence[RigidTransform]) -> dict[str, Scalar]:
+    """Compute the columns of the designated point's visibility from poses of the mast's head; empty without poses."""
+    if not heads:
+        return {}
+    columns = asdict(evaluate_visibility(run.setup.world, run.setup.rig, run.target.point_world, heads, p.vtt))
+    return {"point_in_view": columns.pop("in_view"), **columns}
 
 
 def shadow_columns(p: RoverScenarioParameters, run: RoverRun, views: Sequence[StopView]) -> dict[str, Scalar]:

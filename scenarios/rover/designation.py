@@ -23,6 +23,8 @@ _RING_DIRECTIONS = 12
 #: visibly relative to the rock between steps: "large discontinuities at occluding boundaries" (paper, 5.2). The ground
 #: in the template of a small rock is nearer: 3 % behind a 7 cm rock at 4 m, 8 % behind a 12 cm rock at 10 m.
 BEHIND_FRACTION = 0.1
+#: Minimum fraction of direct sunlight that clouds transmit to a lit point (assumed).
+MIN_TRANSMITTANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class DesignatedTarget:
     point_world: Vector
     designation: TargetDesignation
     on_edge: bool  #: whether the template in one of the first images shows background far behind the rock
-    lit: bool  #: whether the point is in direct sunlight at the start
+    lit: bool  #: whether the point is in direct sunlight when it is designated, see `is_lit`
 
 
 def designate_from_start(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> DesignatedTarget:
@@ -48,7 +50,8 @@ def designate_from_start(p: RoverScenarioParameters, world: RunWorld, rig: Rig, 
         raise ValueError("the mast cannot point at the target's rock from the start; change start.target_azimuth_deg")
     rig.point(*angles)
     head, readings = stance.world_from_rover * rig.rover_from_head, rig.state.readings_rad
-    target = designate_point(world, rig, head, readings, (p.target.across, p.target.up), p.vtt)
+    position, time_s = (p.target.across, p.target.up), p.timing.track_s
+    target = designate_point(world, rig, head, readings, position, p.vtt, time_s)
     if p.target.designation == "pixel":
         return target
     in_rover = triangulate_point(rig, stance, target.point_world)
@@ -79,13 +82,14 @@ def designate_point(
     angles_rad: tuple[float, float],
     position: tuple[float, float],
     options: VttOptions,
+    time_s: float,
     outline_viewpoint: Vector | None = None,
 ) -> DesignatedTarget:
     """Designate a point on the rock's face by its true pixel in the left image.
 
     `position` selects the point in the view from `outline_viewpoint`, by default the left camera: across the outline,
     from -1 (left) to 1 (right), and up, from 0 (foot) to 1 (top). The point is on an edge if it is on an edge for
-    either camera, because stereo matching needs it in both images.
+    either camera, because stereo matching needs it in both images. `time_s` is the time of these images.
     """
     cameras_m, triangles = rig.camera_positions(world_from_head), world.target_triangles
     foot_m = float(world.rocks.position_m[world.target_number, 2])
@@ -94,9 +98,18 @@ def designate_point(
     point = outline.point(*position)
     half_rad = 0.5 * options.template_px * rig.pixel_rad
     on_edge = any(is_on_edge(triangles, foot_m, viewpoint, point, half_rad) for viewpoint in cameras_m)
-    is_lit = not bool(points.find_self_shadow(triangles, point[None], world.sun.direction(0.0))[0])
     pixel = rig.left.project(np.asarray(world_from_head.inv().apply(point.copy())))[0]
-    return DesignatedTarget(point, PixelTarget(np.asarray(pixel), *angles_rad), on_edge, is_lit)
+    return DesignatedTarget(point, PixelTarget(np.asarray(pixel), *angles_rad), on_edge, is_lit(world, point, time_s))
+
+
+def is_lit(world: RunWorld, point: Vector, time_s: float) -> bool:
+    """Whether the target's rock does not shade its point, and clouds transmit at least half of the direct sunlight."""
+    scene = world.scene(time_s)
+    if points.find_self_shadow(world.target_triangles, point[None], scene.sun.direction)[0]:
+        return False
+    if scene.clouds is None:
+        return True
+    return bool(scene.clouds.transmittance(point[None], scene.sun, time_s)[0] >= MIN_TRANSMITTANCE)
 
 
 def is_on_edge(triangles: Triangles, foot_m: float, viewpoint: Vector, point: Vector, half_rad: float) -> bool:

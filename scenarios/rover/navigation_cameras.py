@@ -22,7 +22,7 @@ from marsyard.scenarios.views import CAMERA_MOUNTINGS
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose, rigid
 from marsyard.sim.measurements import MastCalibration, StereoMeasurement
-from marsyard.sim.sensor import Detector, natural_fall_off, preset
+from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off, preset
 from marsyard.sim.sensor.mast import StereoHead, stereo_mast
 from marsyard.sim.streams import Streams
 
@@ -54,12 +54,18 @@ class _StereoPair:
     calibrated: tuple[CameraModel, CameraModel]
 
     @classmethod
-    def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _StereoPair:
-        """Draw the detectors of a pair; `name` is the cameras' preset, `head` has their true and calibrated models."""
+    def draw(
+        cls, p: RoverScenarioParameters, name: str, detector: DetectorParameters, head: StereoHead, streams: Streams
+    ) -> _StereoPair:
+        """Draw the detectors of a pair.
+
+        - name: preset of the cameras; detector: parameters of their detectors, not binned
+        - head: their true and calibrated models
+        """
         factor = 1.0 / p.navigation.binning
         binned_cameras = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
-        detector, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
-        left, right = (Detector.draw(natural_fall_off(camera), detector, rng) for camera in binned_cameras[0])
+        binned_detector, rng = detector.bin(p.navigation.binning), streams.generator(f"{name} response")
+        left, right = (Detector.draw(natural_fall_off(camera), binned_detector, rng) for camera in binned_cameras[0])
         # the exposure is metered in the binned image, which is the whole subframe
         exposure = p.exposure.model_copy(update={"metering": "subframe"})
         parameters = p.model_copy(update={"exposure": exposure})
@@ -111,16 +117,18 @@ class NavigationCameras:
         uses_odometry = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
         mast = body = None
         if uses_odometry or "mast" in mapped_by:
-            name, head = NAVCAMS[p.camera.preset], rig.head
+            # the pair that tracks also navigates, with its calibration, detectors and optics, if it is the navcam
+            name, head, detector = NAVCAMS[p.camera.preset], rig.head, p.camera.detector_parameters()
             if name != p.camera.preset or p.camera.custom is not None:
                 head = StereoHead.draw(stereo_mast(name), p.stereo, streams.generator("navcam calibration"))
-            mast = _StereoPair.draw(p, name, head, streams)
+                detector = preset(name).detector
+            mast = _StereoPair.draw(p, name, detector, head, streams)
         if "body" in mapped_by:
             left, right = preset(HAZCAM).cameras()
             # calibration errors of the body's cameras are sampled like those of a mast's cameras
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
-            body = _StereoPair.draw(p, HAZCAM, head, streams)
+            body = _StereoPair.draw(p, HAZCAM, preset(HAZCAM).detector, head, streams)
         mounting = CAMERA_MOUNTINGS[HAZCAM]
         tilt = Rotation.from_rotvec([0.0, -np.radians(mounting.elevation_deg), 0.0])
         return cls(mast, body, rigid(tilt, np.array(mounting.on_rover_m)))

@@ -426,6 +426,11 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
         return self.model_copy(update=changes)
 
     @property
+    def is_commanded(self) -> bool:
+        """Whether the path consists of commands only, so that it does not depend on the target's reported position."""
+        return all(leg.motion in ("stay", "straight", "turn") for leg in self.legs)
+
+    @property
     def bearing_rad(self) -> float:
         """Direction from the target to the start, clockwise from north."""
         return float(np.radians(self.start.bearing_deg + self.world.incline.oblique_deg))

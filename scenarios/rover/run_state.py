@@ -99,16 +99,23 @@ class Stop(StopView):
         )
 
     def reported_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
-        """Compute the pixel at which the tracker reports the target in the left image; NaN if it was not tracked.
+        """Project the reported position into the left image by the calibrated camera.
 
-        Without details of the match it is the projection of the reported position by the calibrated camera.
+        The pixel is NaN if the target was not tracked, or if the reported position is behind the camera.
         """
         if self.reported_position_rover is None:
             return np.full(2, np.nan)
-        if self.details is not None and self.details.match is not None:
-            return np.asarray(self.details.match.pixel, dtype=np.float64)
         camera = mast.left.transform(mast.geometry.rover_from_head(*self.angles_rad))
         return np.asarray(camera.project(self.reported_position_rover)[0], dtype=np.float64)
+
+    def error_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
+        """Compute the reported minus the true pixel (u, v); NaN if the target was not tracked.
+
+        The error is infinite if the reported or the true position of a tracked target is behind the camera.
+        """
+        error = self.reported_px(mast) - self.point_px
+        is_undefined = self.reported_position_rover is not None and not np.isfinite(error).all()
+        return np.full(2, np.inf) if is_undefined else error
 
     def error_m(self) -> Float64[np.ndarray, "3"]:
         """Compute the reported minus the true position in the rover frame; NaN if no position was reported."""
@@ -141,17 +148,28 @@ class Setup:
 
 @dataclass(frozen=True)
 class Step:
-    """Commanded path and true displacement of a step, metres."""
+    """Commanded path of a step, and its part that the rover truly drove in the commanded direction, metres."""
 
     commanded_m: float
-    displacement_m: float
+    progress_m: float
+
+    @classmethod
+    def from_drives(cls, drives: Sequence[Drive]) -> Step:
+        """Create a step from its drives."""
+        return cls(sum(drive.command.length_m for drive in drives), sum(drive.progress_m for drive in drives))
 
 
 def is_stuck(steps: Sequence[Step], mobility: MobilityParameters) -> bool:
-    """Whether the rover hardly moved over its last steps; False before `mobility.stuck_steps` steps."""
-    last = steps[-mobility.stuck_steps :]
-    commanded_m, displacement_m = sum(step.commanded_m for step in last), sum(step.displacement_m for step in last)
-    return len(last) == mobility.stuck_steps and displacement_m < (1.0 - mobility.stuck_slip) * commanded_m
+    """Whether the slip over any `mobility.stuck_steps` successive steps is above `mobility.stuck_slip`.
+
+    In a shorter run it is the slip over all steps, because the tracker may have ended the run. False without steps.
+    """
+    count = mobility.stuck_steps
+    windows = (steps[first : first + count] for first in range(max(len(steps) - count, 0) + 1))
+    return any(
+        sum(step.progress_m for step in window) < (1.0 - mobility.stuck_slip) * sum(step.commanded_m for step in window)
+        for window in windows
+    )
 
 
 @dataclass

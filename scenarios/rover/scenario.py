@@ -8,8 +8,8 @@ from pydantic import BaseModel
 from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.rover.closed_loop import prepare_run, track_target
-from marsyard.scenarios.rover.conditions import fixed_conditions, visibility_columns
+from marsyard.scenarios.rover.closed_loop import drive_commanded_path, prepare_run, track_target
+from marsyard.scenarios.rover.conditions import fixed_conditions, path_visibility, visibility_columns
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.placement import place_on_target, placement_row, placement_truth
 from marsyard.scenarios.rover.task import TRACKING
@@ -44,7 +44,10 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         p = self.check_parameters(parameters)
         start_s = time.process_time()
         tested_run = prepare_run(p, streams)
+        # a second rover drives a commanded path to its end, also if the tracker loses the target before
+        heads = drive_commanded_path(p, prepare_run(p, streams)) if p.is_commanded else []
         conditions = {**fixed_conditions(p, tested_run), **placement_truth(tested_run)}
+        conditions |= path_visibility(p, tested_run, heads)
 
         def run(algorithm: str) -> AlgorithmRun[ScoredTrack]:
             with_algorithm = p.model_copy(update={"algorithm": algorithm})

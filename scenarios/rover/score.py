@@ -11,7 +11,7 @@ from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome
+from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, is_stuck
 
 #: Quantities of each update, in the order of the columns of stored updates.
 UPDATE_QUANTITIES = (
@@ -21,8 +21,8 @@ UPDATE_QUANTITIES = (
 
 
 def errors_px(run: RoverRun) -> Float64[np.ndarray, "stops 2"]:
-    """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not tracked."""
-    errors = [stop.reported_px(run.setup.rig.calibrated) - stop.point_px for stop in run.stops]
+    """Compute reported minus true pixels (u, v) of the designated point at all stops, see `Stop.error_px`."""
+    errors = [stop.error_px(run.setup.rig.calibrated) for stop in run.stops]
     return np.stack(errors) if errors else np.empty((0, 2))
 
 
@@ -73,9 +73,9 @@ def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
     }
 
 
-def finite_max(values: Float64[np.ndarray, "n"]) -> float:
-    """Return the maximum; NaN without finite values."""
-    return float(np.nanmax(values)) if np.any(np.isfinite(values)) else np.nan
+def known_max(values: Float64[np.ndarray, "n"]) -> float:
+    """Return the maximum of the values that are not NaN; NaN without such values."""
+    return float(np.nanmax(values)) if not np.isnan(values).all() else np.nan
 
 
 #: Columns of `tracking_row`: a quantity and its reduction over the updates.
@@ -93,13 +93,15 @@ REDUCTIONS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
 def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of tracking success and errors at the goal.
 
-    - `tracked`: whether the run is completed and the last tracked pixel is within `tracked_px` of the true
-      projection of the designated point
+    - `tracked`: whether the run is completed and the last reported position, projected into the left image, is within
+      `tracked_px` of the true projection of the designated point
     - `target_held`: the same at the last stop of a run with any outcome, for example of a stuck rover
-    - `stuck`, `mobile`: whether the rover hardly moved at the end (outcome STUCK), and the opposite
+    - `handed_off`: whether a tracked target was handed off to the arm
+    - `stuck`, `mobile`: whether the true slip was above its limit (see `is_stuck`), with any outcome, and the opposite
     - `position_error_m`: distance of the last reported position from the designated point; NaN if the run was not
       completed
-    - `false_updates`: number of updates that report the target farther than `false_track_px` from the true projection
+    - `false_updates`: number of updates that report the target farther than `false_track_px` from the true projection,
+      or behind the camera
     """
     errors = errors_px(run)
     error_sizes_px = np.hypot(*errors.T)
@@ -116,14 +118,14 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     false_updates = int(np.count_nonzero(error_sizes_px > p.score.false_track_px))
     drift = float(np.hypot(*last_error_px))
     is_held = bool(len(error_sizes_px) and error_sizes_px[-1] <= p.score.tracked_px)
-    is_tracked, is_stuck = is_completed and is_held, run.outcome is RunOutcome.STUCK
+    is_tracked, has_stuck_rover = is_completed and is_held, is_stuck(run.steps, p.mobility)
     loss_reasons = next((stop.update.losses for stop in run.stops if stop.update.losses), ())
     return {
         "tracked": is_tracked,
         "not_tracked": not is_tracked,
         "target_held": is_held,
-        "stuck": is_stuck,
-        "mobile": not is_stuck,
+        "stuck": has_stuck_rover,
+        "mobile": not has_stuck_rover,
         "no_false_track": false_updates == 0,
         "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error_m)),
@@ -132,11 +134,11 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         "drift_px": drift,
         "drift_u_px": float(last_error_px[0]),
         "drift_v_px": float(last_error_px[1]),
-        "max_error_px": finite_max(error_sizes_px),
-        "track_margin_px": p.score.false_track_px - finite_max(error_sizes_px),
+        "max_error_px": known_max(error_sizes_px),
+        "track_margin_px": p.score.false_track_px - known_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), np.nan),
-        "handed_off": run.handed_off,
+        "handed_off": run.handed_off and is_held,
     }
 
 

@@ -101,7 +101,8 @@ def render_drive(key: DriveKey) -> SharedDrive:
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = RoverRun(setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
+    viewpoint, time_s = compute_viewpoint(mast), p.timing.track_s
+    run = RoverRun(setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, time_s, viewpoint))
     guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
     if not guide.views:
@@ -114,7 +115,7 @@ def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> RoverRun
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
     target = designate_point(
-        run.setup.world, run.setup.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint
+        run.setup.world, run.setup.rig, head, first.angles_rad, position, p.drive.vtt, first.time_s, drive.viewpoint
     )
     return RoverRun(run.setup, target)
 
@@ -140,8 +141,8 @@ def evaluate_drive_visibility(
 ) -> tuple[Visibility, dict[str, Scalar]]:
     """Evaluate the visibility of a target along a drive, and the columns of the rover's shadow on it, at all stops."""
     world, rig, first = drive.run.setup.world, drive.run.setup.rig, drive.views[0]
-    position = point.across, point.up
-    target = designate_point(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
+    position, head = (point.across, point.up), first.world_from_head
+    target = designate_point(world, rig, head, first.angles_rad, position, options, first.time_s, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
     visibility = evaluate_visibility(world, rig, target.point_world, heads, options)
     run = RoverRun(drive.run.setup, target)

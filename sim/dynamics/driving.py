@@ -164,11 +164,16 @@ class Drive:
         return sum(part.turn_left_rad for part in self.parts)
 
     @property
+    def progress_m(self) -> float:
+        """True path in the commanded direction, metres: sum over the parts; 0 for a turn in place."""
+        return sum(part.progress_m for part in self.parts)
+
+    @property
     def slip(self) -> float:
         """Slip: 1 - true path in the commanded direction / commanded path; NaN for a turn in place."""
         if self.command.length_m < _MIN_PATH_M:
             return float("nan")
-        return 1.0 - sum(part.progress_m for part in self.parts) / self.command.length_m
+        return 1.0 - self.progress_m / self.command.length_m
 
 
 def drive(

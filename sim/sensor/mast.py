@@ -25,7 +25,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import POINTING, STEREO
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.sensor.presets import preset
 
 Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
@@ -135,9 +135,12 @@ Pixels = Annotated[float, Field(ge=0.0, le=50.0)]
 
 
 class StereoCalibrationParameters(Parameters):
-    """Calibration errors of a stereo pair; all except the disparity error are standard deviations."""
+    """Calibration errors of a stereo pair; all except the two of the disparity are standard deviations."""
 
     disparity_error_px: Annotated[Pixels, STEREO, Field(description="limit of the uniform disparity error, px")] = 0.5
+    disparity_offset_px: Annotated[
+        float, STEREO, bounded_field(-50.0, 50.0, "disparity error that is added to the uniform one, px")
+    ] = 0.0
     epipolar_error_px: Annotated[Pixels, STEREO, Field(description="perpendicular to the epipolar lines, px")] = 0.2
     alignment_deg: Annotated[Degrees, STEREO, Field(description="alignment error of the pair per axis, deg")] = 0.05
     roll_deg: Annotated[Degrees, STEREO, Field(description="roll error of each camera, deg")] = 0.01
@@ -156,7 +159,7 @@ class StereoHead:
     @classmethod
     def draw(cls, design: MastCalibration, p: StereoCalibrationParameters, rng: np.random.Generator) -> StereoHead:
         """Draw the calibration errors of a pair."""
-        disparity = p.disparity_error_px * rng.uniform(-1.0, 1.0)
+        disparity = p.disparity_offset_px + p.disparity_error_px * rng.uniform(-1.0, 1.0)
         epipolar = p.epipolar_error_px * rng.standard_normal()
         alignment = Rotation.from_rotvec(np.radians(p.alignment_deg) * rng.standard_normal(3))
         rolls = np.radians(p.roll_deg) * rng.standard_normal(2)

@@ -4,6 +4,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
@@ -103,6 +104,15 @@ def test_no_verdict_depends_on_the_run_time_of_the_host(name: str) -> None:
     for requirement in read_campaign_requirements(name):
         columns = f"{requirement.metric} {requirement.population}".split()
         assert not [column for column in columns if re.search(r"_time(_max|_median)?_s$|measured", column)]
+
+
+def test_disparity_errors_of_table_1_are_normal_with_a_three_sigma_error_of_1_px() -> None:
+    campaign = load_campaign("vtt-accuracy")
+    assert campaign.parameters(0).model_dump()["stereo"]["disparity_error_px"] == 0.0
+    errors_px = np.array([campaign.draws(case)["stereo.disparity_offset_px"] for case in range(1000)])
+    # tolerances: four standard errors of the rms, and of the fraction beyond 2 sigma, which is 4.55 %
+    assert np.sqrt(np.mean(errors_px**2)) == pytest.approx(1.0 / 3.0, abs=4.0 / 3.0 / np.sqrt(2000.0))
+    assert np.mean(np.abs(errors_px) > 2.0 / 3.0) == pytest.approx(0.0455, abs=0.027)
 
 
 def test_bounds_of_table_1_are_the_three_sigma_errors_of_the_paper() -> None:

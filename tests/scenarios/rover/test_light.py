@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.closed_loop import run_case
+from marsyard.scenarios.rover.closed_loop import prepare_run, run_case
+from marsyard.scenarios.rover.designation import is_lit
 from marsyard.scenarios.rover.figures import run_timeline
 from marsyard.scenarios.rover.parameters import MastCameraParameters, MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
@@ -79,6 +80,21 @@ def test_bright_sky_underexposes_full_frames() -> None:
     assert exposure_ratio < 0.3
     contrast = {region: float(np.std(pair.left.counts.astype(float))) for region, pair in first_images.items()}
     assert contrast["full-frame"] == pytest.approx(contrast["subframe"] * exposure_ratio, rel=0.1)
+
+
+def test_lit_points_are_not_in_the_shadow_of_a_cloud() -> None:
+    clouds = {"cover": 0.5, "size_m": 50.0, "edge_m": 5.0, "optical_depth": 20.0, "wind_east_m_s": 5.0}
+    parameters = RoverScenarioParameters.model_validate({**SHORT_RUN, "clouds": clouds})
+    run = prepare_run(parameters, Streams(1, "rover tests", 0))
+    world, point = run.setup.world, run.target.point_world
+    layer, times_s = world.base.clouds, np.arange(0.0, 120.0, 5.0)
+    assert layer is not None
+    transmitted = [layer.transmittance(point[None], world.scene(time_s).sun, time_s)[0] for time_s in times_s]
+    lit = [is_lit(world, point, time_s) for time_s in times_s]
+    assert lit == [fraction >= 0.5 for fraction in transmitted]
+    assert set(lit) == {True, False}
+    # the target is designated in the first images
+    assert run.target.lit is is_lit(world, point, parameters.timing.track_s)
 
 
 EAST = 0.5 * np.pi

@@ -107,6 +107,20 @@ def test_oracles_need_no_navigation_cameras() -> None:
     assert _position_error_m(run) < 0.05
 
 
+@pytest.mark.parametrize(("name", "defocus_px"), [("research-navcam", 1.5), ("research-pancam", 0.0)])
+def test_navcam_has_the_optics_of_the_camera_parameters(name: str, defocus_px: float) -> None:
+    """6 px of defocus are 1.5 px of an image with 4 x 4 pixels summed; the pancam does not navigate."""
+    leg = {"motion": "approach", "goal_m": 4.5, "visual_odometry": True}
+    camera = {"preset": name, "defocus_px": 6.0, "dust_discs": 3, "stray_light": 0.2}
+    parameters = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, "camera": camera, "legs": [leg]})
+    pair = prepare_run(parameters, Streams(4, "rover tests", 0)).setup.navigation_cameras.mast
+    assert pair is not None
+    for detector in pair.camera.detectors:
+        optics, is_same = detector.parameters.optics, name == "research-navcam"
+        assert optics.defocus_px == defocus_px
+        assert (optics.dust_discs, optics.stray_light) == ((3, 0.2) if is_same else (0, 0.0))
+
+
 OPENCV_CALIBRATION = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [640, 0, 321, 0, 640, 238, 0, 0, 1]}\n"
     "distortion_coefficients: {data: [-0.1, 0.02, 0, 0]}\n"

@@ -12,12 +12,19 @@ from tests.scenarios.spies import WrappedTracker
 
 
 class OffsetTracker(WrappedTracker):
-    """Tracker with positions that are 0.3 m too far to the left, reported as tracked."""
+    """Tracker with positions that are 0.3 m too far to the left, reported as tracked with the right details."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         update = super().update(measurements)
         assert update.position_rover is not None
-        return replace(update, position_rover=update.position_rover + np.array([0.0, 0.3, 0.0]), details=None)
+        return replace(update, position_rover=update.position_rover + np.array([0.0, 0.3, 0.0]))
+
+
+class BehindTracker(WrappedTracker):
+    """Tracker that reports a position 2 m behind the rover as tracked."""
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        return replace(super().update(measurements), position_rover=np.array([-2.0, 0.0, 0.3]))
 
 
 class LosingTracker(WrappedTracker):

@@ -136,6 +136,12 @@ def test_disparity_errors_are_uniform_within_their_bound() -> None:
     assert np.std(errors) == pytest.approx(0.5 / np.sqrt(3.0), rel=0.15)
 
 
+def test_disparity_offset_is_added_to_the_disparity_error() -> None:
+    parameters = EXACT_CALIBRATION.model_copy(update={"disparity_offset_px": -1.2})
+    head = StereoHead.draw(stereo_mast("research-navcam"), parameters, _make_rng())
+    assert head.disparity_error_px(1e4) == pytest.approx(-1.2, abs=1e-3)
+
+
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
     misaligned = EXACT_CALIBRATION.model_copy(update={"epipolar_error_px": 1.0})
