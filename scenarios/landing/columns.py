@@ -138,15 +138,16 @@ COLUMNS = Columns(
         flag("site_far_from_hazards", "the site is far from all hazards"),
         error(
             "site_clearance_fraction",
-            "distance of the site from hazards, divided by that of the farthest position",
-            "distance from hazards / largest distance",
+            "distance of the site from hazards and from the border of the ground in both images, divided by the largest "
+            "one of all positions",
+            "distance from hazards and border / largest distance",
         ),
         outcome("site_slope_deg", "true slope at the site", "true slope at the site"),
         outcome("site_roughness_m", "true roughness at the site", "true roughness at the site"),
         error(
             "site_hazard_distance_m",
-            "distance from the site to the nearest hazard",
-            "distance from the site to the nearest hazard",
+            "distance from the site to the nearest unsafe position of the ground around the first image",
+            "distance from the site to the nearest unsafe position",
         ),
         error("site_margin", "distance of slope and roughness from their limits, relative to them; the smaller one"),
         flag("landed", "the helicopter lands", "that land"),
@@ -166,7 +167,11 @@ COLUMNS = Columns(
         outcome("touchdown_north_m", "north position of the touchdown"),
         outcome("touchdown_slope_deg", "true slope at the touchdown"),
         outcome("touchdown_roughness_m", "true roughness at the touchdown"),
-        error("touchdown_hazard_distance_m", "distance from the touchdown to the nearest hazard"),
+        error(
+            "touchdown_hazard_distance_m",
+            "distance from the touchdown to the nearest unsafe position of the ground around the first image",
+            "distance from the touchdown to the nearest unsafe position",
+        ),
         error(
             "touchdown_margin", "distance of slope and roughness at the touchdown from their limits; the smaller one"
         ),

@@ -102,9 +102,11 @@ def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) 
 
     `answer_correct`: the site is safe, or no site is reported and no safe site with margin exists. Where only narrow
     sites exist, both answers are correct, because a narrow site leaves no margin for the errors of the algorithm.
-    `site_clearance_fraction` is the distance of the reported site from the nearest hazard in both images, divided by
-    that of the farthest position; NaN without a site or without hazards. `site_far_from_hazards`: it is at least
-    `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest from all hazards (section III).
+    `site_clearance_fraction` is the distance of the reported site from the nearest position that is unsafe or whose
+    footprint is not in both images, divided by the largest such distance; NaN without a site.
+    `site_far_from_hazards`: it is at least `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest
+    from all hazards, which include the border of the map (section III). `site_hazard_distance_m` is the distance to the
+    nearest unsafe position of the grid, in both images or not.
     """
     position = true_site(estimate, flight)
     row = _ground_row("site", position, truth)

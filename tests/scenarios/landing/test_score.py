@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety, Tracks
 from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.hazards import HazardMaps, safe_site
 from marsyard.algorithms.hda.products import MappedGround
 from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
@@ -120,23 +120,36 @@ def test_answer_is_correct_for_the_true_ground(
 
 
 def test_clearance_is_relative_to_the_farthest_position() -> None:
-    """One hazard in the corner (-4, -4): the opposite corner is 8 sqrt(2) m away, the centre half as far."""
+    """Ground of 9 m x 9 m with a hazard in the corner (-4, -4); the unseen ground begins 1 m beyond its outer positions.
+
+    The centre is farthest from both: 5 m from the unseen ground, and more from the hazard.
+    """
     truth = make_truth(0)
     safe = np.ones_like(truth.covered)
     safe[0, 0] = False
     truth = replace(truth, footprints=replace(truth.footprints, safe=safe))
-    assert truth.clearance_fraction(np.array([4.0, 4.0])) == 1.0
-    assert truth.clearance_fraction(np.array([0.0, 0.0])) == pytest.approx(0.5)
-    assert truth.clearance_fraction(np.array([-4.0, -3.0])) == pytest.approx(1.0 / np.hypot(8.0, 8.0))
-    # outside of the images
+    assert truth.clearance_fraction(np.array([0.0, 0.0])) == 1.0
+    assert truth.clearance_fraction(np.array([2.0, 0.0])) == pytest.approx(3.0 / 5.0)
+    assert truth.clearance_fraction(np.array([-3.0, -3.0])) == pytest.approx(np.sqrt(2.0) / 5.0)
+    # at the border, at a hazard, and outside of the images
+    assert truth.clearance_fraction(np.array([4.0, 4.0])) == pytest.approx(1.0 / 5.0)
+    assert truth.clearance_fraction(np.array([-4.0, -4.0])) == 0.0
     assert truth.clearance_fraction(np.array([9.0, 0.0])) == 0.0
     far, near = (
-        site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (3.0, -3.0)
+        site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (1.0, -3.0)
     )
     assert (far["site_far_from_hazards"], near["site_far_from_hazards"]) == (True, False)
-    # without a hazard every site is equally far
-    safe[0, 0] = True
-    assert np.isnan(replace(truth, footprints=replace(truth.footprints, safe=safe)).clearance_fraction(np.zeros(2)))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_site_of_an_exact_map_is_the_farthest_from_hazards(seed: int) -> None:
+    """The algorithm's selection, applied to the true safety of random ground with unseen positions."""
+    truth, rng = make_truth(0), np.random.default_rng(seed)
+    safe, covered = (rng.random((9, 9)) < probability for probability in (0.8, 0.9))
+    truth = replace(truth, footprints=replace(truth.footprints, safe=safe), covered=covered)
+    site = safe_site(np.where(truth.safe, Safety.SAFE, Safety.HAZARD).astype(np.uint8), np.array([8.0, 0.0]))
+    assert site is not None
+    assert truth.clearance_fraction(truth.positions[site]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("map_scale", "fraction"), [(0.0, 1.0), (1.0, 0.0), (0.5, 0.5)])
@@ -209,3 +222,21 @@ def test_true_track_starts_at_the_middle_of_the_summed_rows(error_rows: float) -
     tracks = Tracks(first, second, np.ones(u.size), np.ones(u.size, dtype=np.bool_))
     row = motion_row(HdaDetails((VIEW, VIEW), tracks=tracks), case.flight, case.pair)
     assert row["tracks_correct"] == row["features_in_view"] == u.size
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 30.0])
+def test_both_images_show_the_whole_edge_of_covered_footprints(roll_deg: float) -> None:
+    """64 points on the edge of each footprint, on the relief; image borders are at -0.5 px and size - 0.5 px."""
+    p = LandingScenarioParameters.model_validate(
+        {"terrain": {"samples": 512}, "image_poses": {"heading_deg": 20.0, "roll_deg": roll_deg}}
+    )
+    case = RenderedFlight.simulate(p, Streams(1, "covered", 0))
+    truth = case.truth
+    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    edge_m = 0.5 * truth.limits.diameter_m * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    positions = truth.positions[truth.covered][:, None] + edge_m
+    points = np.concatenate([positions, truth.relief.average(positions, truth.relief.spacing_m)[..., None]], axis=-1)
+    assert len(points) > 100
+    for camera, state in zip(case.pair.cameras, case.flight.states, strict=True):
+        pixels, _ = camera.transform(state.world_from_body).project(points.reshape(-1, 3))
+        assert np.all((pixels >= -0.5) & (pixels <= np.array(camera.size) - 0.5))
