@@ -1,13 +1,15 @@
 """Tests of the score of a flight's answer against known ground truth."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety, Tracks
+from marsyard.algorithms.hda import HdaDetails, HdaOptions, Matches, MatchStatus, Safety, Tracks
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.hazards import HazardMaps, safe_site
 from marsyard.algorithms.hda.products import MappedGround
@@ -17,6 +19,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.hda_stage_columns import stage_row
+from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.conditions import site_populations
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
@@ -152,22 +155,55 @@ def test_site_of_an_exact_map_is_the_farthest_from_hazards(seed: int) -> None:
     assert truth.clearance_fraction(truth.positions[site]) == pytest.approx(1.0)
 
 
+def compute_map_errors(change_map: Callable[[np.ndarray], np.ndarray]) -> dict[str, Scalar]:
+    """Return the errors of a changed map of inclined ground with 40 rocks, 0.3 m high, on 6 % of its area.
+
+    `change_map` receives the exact elevations of cells of 0.25 m. The map has an additional tilt that does not count.
+    """
+    truth, flight, rng = make_truth(25), make_flight(), np.random.default_rng(3)
+    x, y = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
+    heights = 0.1 * x + 0.01 * rng.standard_normal(x.shape)
+    for rock in rng.uniform(-5.0, 5.0, (40, 2)):
+        heights[np.hypot(x - rock[0], y - rock[1]) < 0.25] += 0.3
+    truth = replace(truth, relief=Relief(heights, -6.0, -6.0, 0.1))
+    start = flight.states[0].position_m
+    cells = ElevationMap(np.zeros((40, 40)), np.array([-4.875, 4.875]) - start[:2], 0.25)
+    local = cells.positions(np.stack(np.indices((40, 40)), axis=-1).astype(np.float64))
+    exact = truth.relief.average(start[:2] + local, 0.25) - start[2]
+    plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
+    ground = make_ground(replace(cells, elevation_m=change_map(exact) + plane), np.zeros((40, 40), dtype=np.uint8))
+    return map_errors(ground, flight, SampledMap.sample(ground, flight, truth, HdaOptions()), truth)
+
+
 @pytest.mark.parametrize(("map_scale", "fraction"), [(0.0, 1.0), (1.0, 0.0), (0.5, 0.5)])
 def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, fraction: float) -> None:
-    """The map contains a fraction of the relief, and an additional tilt that does not count."""
-    truth, flight = make_truth(25), make_flight()
-    start = flight.states[0].position_m
-    cells = ElevationMap(np.zeros((8, 8)), np.array([-3.5, 3.5]) - start[:2], 1.0)
-    rows, columns = np.indices((8, 8))
-    local = cells.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
-    exact = truth.relief.average(start[:2] + local, 1.0) - start[2]
-    plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
-    elevation = replace(cells, elevation_m=map_scale * exact + plane)
-    ground = make_ground(elevation, np.zeros((8, 8), dtype=np.uint8))
-    nothing = np.zeros_like(truth.covered)
-    sampled = SampledMap(nothing, nothing, nothing, np.zeros(nothing.shape))
-    row = map_errors(ground, flight, sampled, truth)
+    row = compute_map_errors(lambda exact: map_scale * exact)
     assert row["relief_error_fraction"] == pytest.approx(fraction, abs=1e-9)
+
+
+def add_gross_errors(exact: np.ndarray) -> np.ndarray:
+    """Shift a fifth of the cells by 1 to 8 m, up or down."""
+    rng = np.random.default_rng(1)
+    shift = rng.uniform(1.0, 8.0, exact.shape) * rng.choice([-1.0, 1.0], exact.shape)
+    return exact + np.where(rng.random(exact.shape) < 0.2, shift, 0.0)
+
+
+def keep_corner(exact: np.ndarray) -> np.ndarray:
+    """Return a map of 2 m x 2 m."""
+    return np.where((np.indices(exact.shape) < 8).all(axis=0), exact, np.nan)
+
+
+@pytest.mark.parametrize(
+    "change_map",
+    [lambda exact: median_filter(exact, 8), add_gross_errors, keep_corner],
+    ids=["without-rocks", "gross-errors", "corner-only"],
+)
+def test_map_without_rocks_or_with_gross_errors_or_of_a_corner_misses_the_bound(
+    change_map: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    (bound,) = {entry.bound for entry in load_campaign("hda-map").definition.requirements}
+    assert bound is not None
+    assert float(compute_map_errors(change_map)["relief_error_fraction"]) > bound
 
 
 def test_answer_without_a_map_has_no_relief_error() -> None:
