@@ -150,8 +150,13 @@ COLUMNS = Columns(
             "distance from the site to the nearest unsafe position",
         ),
         error("site_margin", "distance of slope and roughness from their limits, relative to them; the smaller one"),
+        flag(
+            "descent_target_exists",
+            "the helicopter flies to a site, the reported or the a-priori site, to land",
+            "with a flight to a site",
+        ),
         flag("landed", "the helicopter lands", "that land"),
-        flag("touchdown_safe", "the touchdown is on safe ground"),
+        flag("touchdown_safe", "the helicopter lands on safe ground"),
         error("touchdown_error_m", "distance between true touchdown and true site", "touchdown error"),
         error(
             "touchdown_error_gps_m",

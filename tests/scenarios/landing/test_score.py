@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
@@ -16,13 +17,16 @@ from marsyard.algorithms.hda.products import MappedGround
 from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.running.engine import check_metrics
+from marsyard.reports.decision import requirement_masks
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.hda_stage_columns import stage_row
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.conditions import site_populations
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.map_score import SampledMap, map_errors, map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
@@ -93,10 +97,20 @@ def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
     row = landing_row(None, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3))
-    assert row["landed"] is False
+    assert (row["landed"], row["descent_target_exists"]) == (False, False)
     assert "touchdown_safe" not in row
     # A campaign with touchdown requirements accepts a first case without a landing.
     check_metrics(load_campaign("hda-benign").definition, {**row, "answered": True}, Path())
+
+
+@pytest.mark.parametrize("name", ["HDA-TOUCHDOWN", "HDA-POS"])
+def test_flight_to_a_site_without_touchdown_fails_the_requirements_of_landings(name: str) -> None:
+    transit = Transit.fly(LandingHelicopterParameters(), np.array([0.0, 0.0, 10.0]), 0.0, 0.0, 9.8, Streams(1, "air", 0))
+    flight = replace(make_flight(), transit=transit)
+    row = landing_row(None, SiteEstimate(SITE_REPORTED, SAFE_SITE), flight, make_truth(3))
+    masks = requirement_masks(pd.DataFrame([row]), shipped_requirements()[name].model_dump())
+    assert masks is not None
+    assert [mask.tolist() for mask in masks] == [[True], [False]]
 
 
 @pytest.mark.parametrize(
