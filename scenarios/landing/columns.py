@@ -101,7 +101,7 @@ COLUMNS = Columns(
         outcome("hazards_time_s", "processor time of the hazard detection"),
         error(
             "relief_error_fraction",
-            "RMS elevation error about a plane, divided by that of a plane; ground without an elevation counts as a plane",
+            "RMS elevation error about a plane, divided by that of a plane; ground without elevation counts as a plane",
             "elevation error of the map relative to that of a plane",
         ),
         error("elevation_bias_m", "mean error of the map's elevations"),
@@ -138,8 +138,8 @@ COLUMNS = Columns(
         flag("site_far_from_hazards", "the site is far from all hazards"),
         error(
             "site_clearance_fraction",
-            "distance of the site from hazards and from the border of the ground in both images, divided by the largest "
-            "one of all positions",
+            "distance of the site from hazards and from the border of the ground in both images, divided by the "
+            "largest one",
             "distance from hazards and border / largest distance",
         ),
         outcome("site_slope_deg", "true slope at the site", "true slope at the site"),

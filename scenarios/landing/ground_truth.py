@@ -92,7 +92,7 @@ class GroundTruth:
         return np.asarray(self.covered & ~self.footprints.safe)
 
     def clearance_fraction(self, position: Float[np.ndarray, "2"]) -> float:
-        """Divide the clearance at a position (x, y) by the largest clearance; 0 outside of the grid or if none is safe.
+        """Divide the clearance at a position (x, y) by the largest one; 0 outside of the grid or if none is safe.
 
         The site of the paper's rule, on an exact map, has the fraction 1.
         """
@@ -104,7 +104,7 @@ class GroundTruth:
         return 0.0 if is_outside or largest_m == 0.0 else float(clearance_m[nearest]) / largest_m
 
     def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
-        """Compute the distance from a position (x, y) to the nearest unsafe grid position, visible in both images or not.
+        """Compute the distance from a position (x, y) to the nearest unsafe grid position, in both images or not.
 
         Infinite if no position of the grid is unsafe.
         """

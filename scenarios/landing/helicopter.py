@@ -25,7 +25,6 @@ from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 
-
 #: Maximum error of a time tag in standard deviations: the filter runs until `TAIL_S` after the last image.
 MAX_TAG_DEVIATIONS = 6.0
 
@@ -58,7 +57,7 @@ class LandingHelicopterParameters(Parameters):
         error_s = abs(clock.offset_s) + MAX_TAG_DEVIATIONS * float(np.hypot(clock.offset_sd_s, clock.jitter_sd_s))
         if error_s > rotorcraft.TAIL_S:
             raise ValueError(
-                f"image_clock: |offset_s| plus {MAX_TAG_DEVIATIONS:g} standard deviations (offset_sd_s and jitter_sd_s) "
+                f"image_clock: |offset_s| plus {MAX_TAG_DEVIATIONS:g} standard deviations (offset_sd_s, jitter_sd_s) "
                 f"is {error_s:.3g} s; allowed: at most {rotorcraft.TAIL_S:g} s, the flight after the last image"
             )
         return self

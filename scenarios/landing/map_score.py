@@ -40,7 +40,7 @@ def map_row(
 class SampledMap:
     """The algorithm's hazard map, sampled at the truth's grid positions."""
 
-    #: fraction of the positions whose whole footprint is in both images that have an elevation; 1 without such positions
+    #: fraction of the positions with their whole footprint in both images that have an elevation; 1 without positions
     mapped_fraction: float
     #: whether the map has slope and roughness at the position, and both images show the whole footprint
     valid: Bool[np.ndarray, "rows columns"]

@@ -160,8 +160,8 @@ def landing_row(
     means of the standard deviations that the receiver reports. `landing_after_s` is the time from the second image
     to touchdown. `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter
     and the change of the path in the last iteration (`marsyard.scenarios.landing.touchdown`).
-    `descent_target_exists`: the helicopter flies to a site. Without a touchdown the numbers are NaN; `touchdown_safe` is
-    false if the helicopter flies to a site, which it then does not reach in time, and missing otherwise.
+    `descent_target_exists`: the helicopter flies to a site. Without a touchdown, numbers are NaN; `touchdown_safe` is
+    false if the helicopter flies to a site but does not touch down in time, and missing without such a flight.
     """
     site = estimate.site_world
     if touchdown is None or site is None:

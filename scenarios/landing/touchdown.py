@@ -81,7 +81,9 @@ def land(
     errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
     limits_m = parameters.min_range_m, parameters.max_range_m
     x, y, z = laser.axis.tolist()
-    altimeter = rotorcraft.AltimeterErrors(laser.scale, errors_m, laser_stuck_m, parameters.count_m, limits_m, (x, y, z))
+    altimeter = rotorcraft.AltimeterErrors(
+        laser.scale, errors_m, laser_stuck_m, parameters.count_m, limits_m, (x, y, z)
+    )
     start = float(transit.navigation_leg.boundaries_s[-1])
     transit_errors = _interpolate_at_knots(
         path, transit.navigation_leg.boundaries_s, transit.navigation_leg.errors(path)

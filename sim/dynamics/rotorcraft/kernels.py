@@ -161,11 +161,13 @@ def _read_laser(ground: GroundPatch, row: Array, noise: float, landing: Landing)
     """Simulate a reading of the laser, metres; infinite without a return."""
     if not math.isnan(landing.laser_stuck_m):
         return landing.laser_stuck_m
-    distance = compute_laser_range(ground, row, landing.laser_x, landing.laser_y, landing.laser_z)
+    distance: float = compute_laser_range(ground, row, landing.laser_x, landing.laser_y, landing.laser_z)
     if distance < landing.laser_min_m or distance > landing.laser_max_m:
         return math.inf
     reading = landing.laser_scale * distance + noise
-    return reading if landing.laser_count_m == 0.0 else landing.laser_count_m * round(reading / landing.laser_count_m)
+    if landing.laser_count_m > 0.0:
+        reading = landing.laser_count_m * round(reading / landing.laser_count_m)
+    return reading
 
 
 @njit(cache=True)

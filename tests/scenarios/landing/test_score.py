@@ -105,7 +105,9 @@ def test_flight_without_landing_has_no_touchdown_score() -> None:
 
 @pytest.mark.parametrize("name", ["HDA-TOUCHDOWN", "HDA-POS"])
 def test_flight_to_a_site_without_touchdown_fails_the_requirements_of_landings(name: str) -> None:
-    transit = Transit.fly(LandingHelicopterParameters(), np.array([0.0, 0.0, 10.0]), 0.0, 0.0, 9.8, Streams(1, "air", 0))
+    transit = Transit.fly(
+        LandingHelicopterParameters(), np.array([0.0, 0.0, 10.0]), 0.0, 0.0, 9.8, Streams(1, "air", 0)
+    )
     flight = replace(make_flight(), transit=transit)
     row = landing_row(None, SiteEstimate(SITE_REPORTED, SAFE_SITE), flight, make_truth(3))
     masks = requirement_masks(pd.DataFrame([row]), shipped_requirements()[name].model_dump())
@@ -137,7 +139,7 @@ def test_answer_is_correct_for_the_true_ground(
 
 
 def test_clearance_is_relative_to_the_farthest_position() -> None:
-    """Ground of 9 m x 9 m with a hazard in the corner (-4, -4); the unseen ground begins 1 m beyond its outer positions.
+    """Ground of 9 m x 9 m with a hazard in the corner (-4, -4); the unseen ground begins 1 m beyond the outer ones.
 
     The centre is farthest from both: 5 m from the unseen ground, and more from the hazard.
     """
@@ -182,7 +184,8 @@ def compute_map_errors(change_map: Callable[[np.ndarray], np.ndarray]) -> dict[s
     truth = replace(truth, relief=Relief(heights, -6.0, -6.0, 0.1))
     start = flight.states[0].position_m
     cells = ElevationMap(np.zeros((40, 40)), np.array([-4.875, 4.875]) - start[:2], 0.25)
-    local = cells.positions(np.stack(np.indices((40, 40)), axis=-1).astype(np.float64))
+    rows, columns = np.indices((40, 40))
+    local = cells.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
     exact = truth.relief.average(start[:2] + local, 0.25) - start[2]
     plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
     ground = make_ground(replace(cells, elevation_m=change_map(exact) + plane), np.zeros((40, 40), dtype=np.uint8))
