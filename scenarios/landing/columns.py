@@ -101,12 +101,12 @@ COLUMNS = Columns(
         outcome("hazards_time_s", "processor time of the hazard detection"),
         error(
             "relief_error_fraction",
-            "elevation error without its mean plane, divided by that of a plane",
+            "RMS elevation error about a plane, divided by that of a plane; ground without elevation counts as a plane",
             "elevation error of the map relative to that of a plane",
         ),
         error("elevation_bias_m", "mean error of the map's elevations"),
         error("elevation_rms_m", "root mean square of the map's elevation errors"),
-        error("elevation_noise_m", "robust standard deviation of the map's elevation errors"),
+        error("elevation_noise_m", "robust standard deviation of the map's elevation errors about a plane"),
         error("elevation_median_error_m", "median magnitude of the map's elevation errors"),
         error("elevation_outliers", "fraction of the cells with a gross elevation error"),
         error("slope_error_bias_deg", "mean error of the footprints' slopes"),
@@ -138,19 +138,25 @@ COLUMNS = Columns(
         flag("site_far_from_hazards", "the site is far from all hazards"),
         error(
             "site_clearance_fraction",
-            "distance of the site from hazards, divided by that of the farthest position",
-            "distance from hazards / largest distance",
+            "distance of the site from hazards and from the border of the ground in both images, divided by the "
+            "largest one",
+            "distance from hazards and border / largest distance",
         ),
         outcome("site_slope_deg", "true slope at the site", "true slope at the site"),
         outcome("site_roughness_m", "true roughness at the site", "true roughness at the site"),
         error(
             "site_hazard_distance_m",
-            "distance from the site to the nearest hazard",
-            "distance from the site to the nearest hazard",
+            "distance from the site to the nearest unsafe position of the ground around the first image",
+            "distance from the site to the nearest unsafe position",
         ),
         error("site_margin", "distance of slope and roughness from their limits, relative to them; the smaller one"),
+        flag(
+            "descent_target_exists",
+            "the helicopter flies to a site, the reported or the a-priori site, to land",
+            "with a flight to a site",
+        ),
         flag("landed", "the helicopter lands", "that land"),
-        flag("touchdown_safe", "the touchdown is on safe ground"),
+        flag("touchdown_safe", "the helicopter lands on safe ground"),
         error("touchdown_error_m", "distance between true touchdown and true site", "touchdown error"),
         error(
             "touchdown_error_gps_m",
@@ -166,7 +172,11 @@ COLUMNS = Columns(
         outcome("touchdown_north_m", "north position of the touchdown"),
         outcome("touchdown_slope_deg", "true slope at the touchdown"),
         outcome("touchdown_roughness_m", "true roughness at the touchdown"),
-        error("touchdown_hazard_distance_m", "distance from the touchdown to the nearest hazard"),
+        error(
+            "touchdown_hazard_distance_m",
+            "distance from the touchdown to the nearest unsafe position of the ground around the first image",
+            "distance from the touchdown to the nearest unsafe position",
+        ),
         error(
             "touchdown_margin", "distance of slope and roughness at the touchdown from their limits; the smaller one"
         ),

@@ -64,7 +64,8 @@ class GroundTruth:
             with np.errstate(invalid="ignore"):
                 visible &= in_front & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
         distance_to_invisible_m = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
-        covered = distance_to_invisible_m >= 0.5 * limits.diameter_m
+        # invisible ground can be nearer than the nearest grid point on it, by up to half the diagonal of a grid cell
+        covered = distance_to_invisible_m >= 0.5 * limits.diameter_m + step / np.sqrt(2.0)
         return cls(relief, limits, positions, relief.footprints(positions, limits), covered, step)
 
     @property
@@ -73,10 +74,17 @@ class GroundTruth:
         return np.asarray(self.covered & self.footprints.safe)
 
     @property
+    def clearance_m(self) -> Float[np.ndarray, "rows columns"]:
+        """Distance of each position from the nearest one that is not safe or whose footprint is not in both images.
+
+        Positions that the images do not show count as hazards (paper, section III: borders "are considered hazards").
+        """
+        return np.asarray(distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m)
+
+    @property
     def safe_with_margin(self) -> Bool[np.ndarray, "rows columns"]:
         """Positions around which all positions within one footprint radius are also safe."""
-        distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
-        return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
+        return np.asarray(self.clearance_m > 0.5 * self.limits.diameter_m)
 
     @property
     def visible_hazards(self) -> Bool[np.ndarray, "rows columns"]:
@@ -84,22 +92,22 @@ class GroundTruth:
         return np.asarray(self.covered & ~self.footprints.safe)
 
     def clearance_fraction(self, position: Float[np.ndarray, "2"]) -> float:
-        """Compute the distance of a position (x, y) from the nearest visible hazard, divided by the largest distance.
+        """Divide the clearance at a position (x, y) by the largest one; 0 outside of the grid or if none is safe.
 
-        The largest distance is that of a position whose footprint is in both images. The result is 0 outside of the
-        images and without a safe position in them, and NaN without a visible hazard.
+        The site of the paper's rule, on an exact map, has the fraction 1.
         """
-        if not np.any(self.visible_hazards):
-            return float("nan")
-        distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
-        nearest = int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T)))
-        row, column = np.unravel_index(nearest, distances.shape)
-        is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
-        largest = float(distances.max())
-        return 0.0 if is_outside or largest == 0.0 else float(distances[row, column]) / largest
+        clearance_m = self.clearance_m.ravel()
+        distances_m = np.hypot(*(self.positions.reshape(-1, 2) - position).T)
+        nearest = int(np.argmin(distances_m))
+        is_outside = distances_m[nearest] > self.step_m
+        largest_m = float(clearance_m.max())
+        return 0.0 if is_outside or largest_m == 0.0 else float(clearance_m[nearest]) / largest_m
 
     def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
-        """Compute the distance from a position (x, y) to the nearest unsafe grid position."""
+        """Compute the distance from a position (x, y) to the nearest unsafe grid position, in both images or not.
+
+        Infinite if no position of the grid is unsafe.
+        """
         unsafe = self.positions[~self.footprints.safe]
         return float(np.hypot(*(unsafe - position).T).min()) if len(unsafe) else float("inf")
 

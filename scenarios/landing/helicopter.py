@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics import State, Trajectory, rotorcraft
 from marsyard.sim.error_sources import COMPASS, INERTIAL, RECEIVER
@@ -24,6 +24,9 @@ from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
+
+#: Maximum error of a time tag in standard deviations: the filter runs until `TAIL_S` after the last image.
+MAX_TAG_DEVIATIONS = 6.0
 
 
 class LandingHelicopterParameters(Parameters):
@@ -47,6 +50,17 @@ class LandingHelicopterParameters(Parameters):
     averaging_s: float = Field(
         default=5.0, gt=0.0, le=600.0, description="duration of the average: dozens of solutions, as in the paper"
     )
+
+    @model_validator(mode="after")
+    def _check_image_clock(self) -> LandingHelicopterParameters:
+        clock = self.image_clock
+        error_s = abs(clock.offset_s) + MAX_TAG_DEVIATIONS * float(np.hypot(clock.offset_sd_s, clock.jitter_sd_s))
+        if error_s > rotorcraft.TAIL_S:
+            raise ValueError(
+                f"image_clock: |offset_s| plus {MAX_TAG_DEVIATIONS:g} standard deviations (offset_sd_s, jitter_sd_s) "
+                f"is {error_s:.3g} s; allowed: at most {rotorcraft.TAIL_S:g} s, the flight after the last image"
+            )
+        return self
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -40,6 +40,8 @@ def map_row(
 class SampledMap:
     """The algorithm's hazard map, sampled at the truth's grid positions."""
 
+    #: fraction of the positions with their whole footprint in both images that have an elevation; 1 without positions
+    mapped_fraction: float
     #: whether the map has slope and roughness at the position, and both images show the whole footprint
     valid: Bool[np.ndarray, "rows columns"]
     safe: Bool[np.ndarray, "rows columns"]  #: whether the map classifies the position as safe
@@ -60,10 +62,12 @@ class SampledMap:
             is_hazard = (hazards.slope_rad > options.max_slope_rad) | (hazards.roughness_m > options.max_roughness_m)
         radius = 0.5 * truth.limits.diameter_m / ground.elevation.cell_m
         flagged = distance_transform_edt(~is_hazard) <= radius if np.any(is_hazard) else np.zeros_like(is_hazard)
+        has_elevation = is_inside & np.isfinite(ground.elevation.elevation_m[rows, columns])
+        mapped_fraction = float(np.mean(has_elevation[truth.covered])) if np.any(truth.covered) else 1.0
         slope = hazards.slope_rad[rows, columns]
         valid = is_inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
         safe = valid & (hazards.safety[rows, columns] == Safety.SAFE)
-        return cls(valid, safe, valid & flagged[rows, columns], slope)
+        return cls(mapped_fraction, valid, safe, valid & flagged[rows, columns], slope)
 
 
 def count_hazards(ground: MappedGround, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
@@ -117,10 +121,12 @@ def map_errors(
 
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean
     error, `rms` the RMS error, `median_error` the median absolute error. `noise` is the robust standard deviation of
-    the errors about a fitted plane; it affects roughness. `relief_error_fraction` is `noise` divided by the same
-    deviation of the exact heights: it is 1 for a plane, which needs no images, and 0 for an exact map. `outliers` is
-    the fraction of errors about the plane beyond `OUTLIER_DEVIATIONS` times `noise`. The result is empty for fewer than
-    four cells with an elevation.
+    the errors about a fitted plane; `outliers` is the fraction of errors about this plane beyond `OUTLIER_DEVIATIONS`
+    times `noise`. The result is empty for fewer than four cells with an elevation.
+
+    `relief_error_fraction` is the RMS of the errors about their plane of least squares, divided by that of the exact
+    heights. Rocks that the map lacks and gross errors count, unlike in robust deviations. Ground in both images without
+    an elevation has the error of a plane. The result is 1 for a plane, which needs no images, and 0 for an exact map.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
@@ -134,7 +140,10 @@ def map_errors(
         return {}
     design = np.column_stack([local[is_finite], np.ones(values.size)])
     residuals = _subtract_plane(design, values)
-    noise, relief = _robust_deviation(residuals), _robust_deviation(_subtract_plane(design, exact[is_finite]))
+    noise = _robust_deviation(residuals)
+    pair = np.column_stack([values, exact[is_finite]])
+    error, relief = np.std(pair - design @ np.linalg.lstsq(design, pair, rcond=None)[0], axis=0)
+    mapped = sampled.mapped_fraction
     slope_errors = (sampled.slope_rad - truth.footprints.slope_rad)[sampled.valid]
     has_slopes = slope_errors.size > 0
     return {
@@ -142,7 +151,7 @@ def map_errors(
         "elevation_rms_m": float(np.sqrt(np.mean(values**2))),
         "elevation_median_error_m": float(np.median(np.abs(values))),
         "elevation_noise_m": noise,
-        "relief_error_fraction": noise / relief,
+        "relief_error_fraction": float(np.sqrt(mapped * (error / relief) ** 2 + 1.0 - mapped)),
         "elevation_outliers": float(np.mean(np.abs(residuals) > OUTLIER_DEVIATIONS * noise)),
         "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if has_slopes else np.nan,
         "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if has_slopes else np.nan,

@@ -91,7 +91,9 @@ class Relief:
         """Compute mean heights of squares of side `side_m` around positions (x, y); NaN outside the grid."""
         width = max(round(side_m / self.spacing_m), 1)
         means = cv2.blur(self.heights_m, (width, width)) if width > 1 else self.heights_m
-        rows, columns = np.moveaxis(self.cells(points).astype(np.float32), -1, 0)
+        # the mean of an even number of points is centred half a point before the position at which cv2 stores it
+        cells = self.cells(points) + 0.5 * (1 - width % 2)
+        rows, columns = np.moveaxis(cells.astype(np.float32), -1, 0)
         return np.asarray(
             cv2.remap(means, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
         )

@@ -102,9 +102,11 @@ def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) 
 
     `answer_correct`: the site is safe, or no site is reported and no safe site with margin exists. Where only narrow
     sites exist, both answers are correct, because a narrow site leaves no margin for the errors of the algorithm.
-    `site_clearance_fraction` is the distance of the reported site from the nearest hazard in both images, divided by
-    that of the farthest position; NaN without a site or without hazards. `site_far_from_hazards`: it is at least
-    `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest from all hazards (section III).
+    `site_clearance_fraction` is the distance of the reported site from the nearest position that is unsafe or whose
+    footprint is not in both images, divided by the largest such distance; NaN without a site.
+    `site_far_from_hazards`: it is at least `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest
+    from all hazards, which include the border of the map (section III). `site_hazard_distance_m` is the distance to the
+    nearest unsafe position of the grid, in both images or not.
     """
     position = true_site(estimate, flight)
     row = _ground_row("site", position, truth)
@@ -157,17 +159,21 @@ def landing_row(
     touchdown. `gps_solutions` is the number of averaged solutions; `gps_sd_north_m` and `gps_sd_east_m` are the
     means of the standard deviations that the receiver reports. `landing_after_s` is the time from the second image
     to touchdown. `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter
-    and the change of the path in the last iteration (`marsyard.scenarios.landing.touchdown`). Without a touchdown,
-    numbers are NaN, and `touchdown_safe` is missing.
+    and the change of the path in the last iteration (`marsyard.scenarios.landing.touchdown`).
+    `descent_target_exists`: the helicopter flies to a site. Without a touchdown, numbers are NaN; `touchdown_safe` is
+    false if the helicopter flies to a site but does not touch down in time, and missing without such a flight.
     """
     site = estimate.site_world
     if touchdown is None or site is None:
         columns = (*(f"touchdown_{column}" for column in GROUND_COLUMNS), *TOUCHDOWN_COLUMNS)
-        return {"landed": False, **dict.fromkeys(columns, np.nan)}
+        has_target = flight.transit is not None and site is not None
+        flags = {"descent_target_exists": has_target, "landed": False}
+        return {**flags, **({"touchdown_safe": False} if has_target else {}), **dict.fromkeys(columns, np.nan)}
     position, velocity = touchdown.state.position_m, touchdown.state.velocity_m_s
     gps_sd_east_m, gps_sd_north_m, _ = touchdown.gps_deviation_m
     ground_row = _ground_row("touchdown", position[:2], truth)
     return {
+        "descent_target_exists": True,
         "landed": True,
         **ground_row,
         "touchdown_error_gps_m": horizontal_distance_m(touchdown.gps_m, site),

@@ -76,9 +76,14 @@ def land(
     range: infinite if it returns no range, None if it has no fault.
     """
     p, path = transit.parameters, transit.flight.path
-    noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
+    parameters = laser.parameters
+    noise = np.hypot(parameters.noise_m, parameters.noise * p.guidance.flare_range_m)
     errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
-    altimeter = rotorcraft.AltimeterErrors(laser.scale, errors_m, laser_stuck_m)
+    limits_m = parameters.min_range_m, parameters.max_range_m
+    x, y, z = laser.axis.tolist()
+    altimeter = rotorcraft.AltimeterErrors(
+        laser.scale, errors_m, laser_stuck_m, parameters.count_m, limits_m, (x, y, z)
+    )
     start = float(transit.navigation_leg.boundaries_s[-1])
     transit_errors = _interpolate_at_knots(
         path, transit.navigation_leg.boundaries_s, transit.navigation_leg.errors(path)

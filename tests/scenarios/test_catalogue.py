@@ -79,7 +79,7 @@ AVAILABILITY = {
     "relief_error_fraction", "tracked_well",
 }  # fmt: skip
 #: Columns that depend on the answer of an algorithm, and therefore also on its refusals.
-ANSWER_FLAGS = {"valid", "site_reported", "landed", "fixed_in_time", "position_reported", "answered"}
+ANSWER_FLAGS = {"valid", "site_reported", "descent_target_exists", "fixed_in_time", "position_reported", "answered"}
 
 
 def read_campaign_requirements(name: str) -> tuple[Requirement, ...]:

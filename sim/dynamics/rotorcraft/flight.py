@@ -130,11 +130,17 @@ class AltimeterErrors:
     - scale: reading / true range
     - noise_m: noise of the reading at each knot from the flight's start on
     - stuck_m: the constant reading of a failed altimeter
+    - count_m: resolution of the readings, 0 without rounding
+    - limits_m: minimum and maximum true range; there is no return beyond them
+    - axis: direction of measurement, body axes
     """
 
     scale: float
     noise_m: Float64[np.ndarray, "knots"]
     stuck_m: float | None = None
+    count_m: float = 0.0
+    limits_m: tuple[float, float] = (0.0, np.inf)
+    axis: tuple[float, float, float] = (0.0, 0.0, -1.0)
 
 
 class Phase(Enum):
@@ -255,6 +261,12 @@ def simulate_landing(
         wait_until=start + round((guidance.wait_s - TAIL_S) / step),
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
+        laser_count_m=laser.count_m,
+        laser_min_m=laser.limits_m[0],
+        laser_max_m=laser.limits_m[1],
+        laser_x=laser.axis[0],
+        laser_y=laser.axis[1],
+        laser_z=laser.axis[2],
     )
     flight = kernels.Flight(rows, transit.autopilot.copy(), transit.heading_rad, air.mean_m_s, air.gusts_m_s, step)
     craft = transit.craft.to_kernel(transit.path.gravity_m_s2)

@@ -57,7 +57,7 @@ class Craft(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """Constants of the landing: `LandingGuidance`, the site in navigation's coordinates, and the laser's errors.
+    """Constants of the landing: `LandingGuidance`, the site in navigation's coordinates, and the laser altimeter.
 
     - hover_m: height of the hover and of the approach
     - wait_until: row at which the approach begins
@@ -66,6 +66,9 @@ class Landing(NamedTuple):
     - descent_m_s, flare_m_s: commanded sink rates of descent and flare
     - flare_range_m: laser range at which the flare begins
     - laser_scale, laser_stuck_m: factor of the laser's range; constant reading of a stuck laser, NaN if it works
+    - laser_count_m: resolution of a reading, 0 without rounding
+    - laser_min_m, laser_max_m: limits of the true range; there is no return beyond them
+    - laser_x, laser_y, laser_z: direction of the laser in body axes
     """
 
     site_east_m: float
@@ -79,6 +82,12 @@ class Landing(NamedTuple):
     flare_m_s: float
     laser_scale: float
     laser_stuck_m: float
+    laser_count_m: float
+    laser_min_m: float
+    laser_max_m: float
+    laser_x: float
+    laser_y: float
+    laser_z: float
 
 
 class Flight(NamedTuple):
@@ -126,21 +135,39 @@ def compute_ground_height(ground: GroundPatch, east: float, north: float) -> flo
 
 
 @njit(cache=True)
-def compute_laser_range(ground: GroundPatch, row: Array) -> float:
-    """Compute the range along body -z to the ground; the beam is nearly vertical: four fixed-point steps converge."""
+def compute_laser_range(ground: GroundPatch, row: Array, axis_x: float, axis_y: float, axis_z: float) -> float:
+    """Compute the range to the ground along an axis of the body.
+
+    The beam is nearly vertical: four fixed-point steps converge.
+    """
     yaw, pitch, roll = row[ANGLE], row[ANGLE + 1], row[ANGLE + 2]
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
-    forward = cr * sp
-    left = -sr
-    down = cr * cp
-    east = -(math.cos(yaw) * forward - math.sin(yaw) * left)
-    north = -(math.sin(yaw) * forward + math.cos(yaw) * left)
+    left = cr * axis_y - sr * axis_z
+    up = sr * axis_y + cr * axis_z
+    forward = cp * axis_x + sp * up
+    down = sp * axis_x - cp * up
+    east = math.cos(yaw) * forward - math.sin(yaw) * left
+    north = math.sin(yaw) * forward + math.cos(yaw) * left
     distance = 0.0
     for _ in range(4):
         x, y = row[POSITION] + distance * east, row[POSITION + 1] + distance * north
         height = row[POSITION + 2] - compute_ground_height(ground, x, y)
         distance = height / down
     return distance
+
+
+@njit(cache=True)
+def _read_laser(ground: GroundPatch, row: Array, noise: float, landing: Landing) -> float:
+    """Simulate a reading of the laser, metres; infinite without a return."""
+    if not math.isnan(landing.laser_stuck_m):
+        return landing.laser_stuck_m
+    distance: float = compute_laser_range(ground, row, landing.laser_x, landing.laser_y, landing.laser_z)
+    if distance < landing.laser_min_m or distance > landing.laser_max_m:
+        return math.inf
+    reading = landing.laser_scale * distance + noise
+    if landing.laser_count_m > 0.0:
+        reading = landing.laser_count_m * round(reading / landing.laser_count_m)
+    return reading
 
 
 @njit(cache=True)
@@ -291,9 +318,7 @@ def land(
         if phase == APPROACH and math.hypot(to_site_east, to_site_north) < landing.near_m:
             phase = DESCEND
         if phase == DESCEND:
-            reading = landing.laser_scale * compute_laser_range(ground, rows[delayed]) + laser_noise[delayed]
-            if not math.isnan(landing.laser_stuck_m):
-                reading = landing.laser_stuck_m
+            reading = _read_laser(ground, rows[delayed], laser_noise[delayed], landing)
             if reading < landing.flare_range_m:
                 phase = FLARE
         # goal: the current position in WAIT and FLARE, otherwise a point towards the site, limited by the speed

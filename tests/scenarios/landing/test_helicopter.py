@@ -7,7 +7,7 @@ import pytest
 
 from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m, land
-from marsyard.sim.dynamics.rotorcraft import GroundPatch
+from marsyard.sim.dynamics.rotorcraft import GroundPatch, Phase
 from marsyard.sim.sensor import LaserParameters
 from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
@@ -35,9 +35,9 @@ def _fly_landing(case: int) -> tuple[Transit, Touchdown]:
     return transit, _land(transit, streams)
 
 
-def _land(transit: Transit, streams: Streams, stuck_m: float | None = None) -> Touchdown:
-    """Land at `SITE`; a stuck altimeter always reads `stuck_m`."""
-    unit = RangingUnit.draw(LaserParameters(), streams.generator("laser"))
+def _land(transit: Transit, streams: Streams, stuck_m: float | None = None, **laser: float) -> Touchdown:
+    """Land at `SITE` with a laser altimeter with the parameters `laser`; a stuck one always reads `stuck_m`."""
+    unit = RangingUnit.draw(LaserParameters.model_validate(laser), streams.generator("laser"))
     touchdown = land(transit, SITE, GROUND, unit, streams, stuck_m)
     assert touchdown is not None
     return touchdown
@@ -171,6 +171,29 @@ def test_stuck_altimeter_causes_a_hard_landing() -> None:
     transit, streams = _fly_transit(0)
     assert -_land(transit, streams).state.velocity_m_s[2] == pytest.approx(0.3, abs=0.15)
     assert -_land(transit, streams, stuck_m=8.0).state.velocity_m_s[2] == pytest.approx(0.7, abs=0.15)
+
+
+@pytest.mark.parametrize("changes", [{"min_range_m": 3.0}, {"max_range_m": 0.3}])
+def test_altimeter_without_readings_below_the_flare_range_causes_a_hard_landing(changes: dict[str, float]) -> None:
+    """The flare begins at 1.5 m above the ground; the camera touches down at 0.4 m."""
+    transit, streams = _fly_transit(0)
+    sink_m_s = -_land(transit, streams, **changes).state.velocity_m_s[2]
+    assert sink_m_s == pytest.approx(0.7, abs=0.15)
+
+
+def test_rounded_readings_start_the_flare() -> None:
+    """With a resolution of 4 m, ranges below 2 m are rounded to zero, which is below 1.5 m."""
+    transit, streams = _fly_transit(0)
+    flight = _land(transit, streams, count_m=4.0, noise_m=0.0).flight
+    start_s = flight.phase_start_s(Phase.FLARE)
+    assert start_s is not None
+    # the command is delayed by 0.1 s: 0.07 m at the speed of the descent
+    assert flight.path.state(start_s).position_m[2] == pytest.approx(2.0 - 0.07, abs=0.03)
+
+
+def test_time_tags_after_the_end_of_the_filter_are_rejected() -> None:
+    with pytest.raises(ValueError, match=r"image_clock: .* is 3 s; allowed: at most 0.1 s"):
+        LandingHelicopterParameters.model_validate({"image_clock": {"offset_sd_s": 0.5, "jitter_sd_s": 0.0}})
 
 
 def test_overlong_landing_has_no_touchdown() -> None:

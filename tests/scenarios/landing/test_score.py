@@ -1,25 +1,32 @@
 """Tests of the score of a flight's answer against known ground truth."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety, Tracks
+from marsyard.algorithms.hda import HdaDetails, HdaOptions, Matches, MatchStatus, Safety, Tracks
 from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.hazards import HazardMaps, safe_site
 from marsyard.algorithms.hda.products import MappedGround
 from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.running.engine import check_metrics
+from marsyard.reports.decision import requirement_masks
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.hda_stage_columns import stage_row
+from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.conditions import site_populations
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.map_score import SampledMap, map_errors, map_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
@@ -90,10 +97,22 @@ def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
     row = landing_row(None, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3))
-    assert row["landed"] is False
+    assert (row["landed"], row["descent_target_exists"]) == (False, False)
     assert "touchdown_safe" not in row
     # A campaign with touchdown requirements accepts a first case without a landing.
     check_metrics(load_campaign("hda-benign").definition, {**row, "answered": True}, Path())
+
+
+@pytest.mark.parametrize("name", ["HDA-TOUCHDOWN", "HDA-POS"])
+def test_flight_to_a_site_without_touchdown_fails_the_requirements_of_landings(name: str) -> None:
+    transit = Transit.fly(
+        LandingHelicopterParameters(), np.array([0.0, 0.0, 10.0]), 0.0, 0.0, 9.8, Streams(1, "air", 0)
+    )
+    flight = replace(make_flight(), transit=transit)
+    row = landing_row(None, SiteEstimate(SITE_REPORTED, SAFE_SITE), flight, make_truth(3))
+    masks = requirement_masks(pd.DataFrame([row]), shipped_requirements()[name].model_dump())
+    assert masks is not None
+    assert [mask.tolist() for mask in masks] == [[True], [False]]
 
 
 @pytest.mark.parametrize(
@@ -120,41 +139,88 @@ def test_answer_is_correct_for_the_true_ground(
 
 
 def test_clearance_is_relative_to_the_farthest_position() -> None:
-    """One hazard in the corner (-4, -4): the opposite corner is 8 sqrt(2) m away, the centre half as far."""
+    """Ground of 9 m x 9 m with a hazard in the corner (-4, -4); the unseen ground begins 1 m beyond the outer ones.
+
+    The centre is farthest from both: 5 m from the unseen ground, and more from the hazard.
+    """
     truth = make_truth(0)
     safe = np.ones_like(truth.covered)
     safe[0, 0] = False
     truth = replace(truth, footprints=replace(truth.footprints, safe=safe))
-    assert truth.clearance_fraction(np.array([4.0, 4.0])) == 1.0
-    assert truth.clearance_fraction(np.array([0.0, 0.0])) == pytest.approx(0.5)
-    assert truth.clearance_fraction(np.array([-4.0, -3.0])) == pytest.approx(1.0 / np.hypot(8.0, 8.0))
-    # outside of the images
+    assert truth.clearance_fraction(np.array([0.0, 0.0])) == 1.0
+    assert truth.clearance_fraction(np.array([2.0, 0.0])) == pytest.approx(3.0 / 5.0)
+    assert truth.clearance_fraction(np.array([-3.0, -3.0])) == pytest.approx(np.sqrt(2.0) / 5.0)
+    # at the border, at a hazard, and outside of the images
+    assert truth.clearance_fraction(np.array([4.0, 4.0])) == pytest.approx(1.0 / 5.0)
+    assert truth.clearance_fraction(np.array([-4.0, -4.0])) == 0.0
     assert truth.clearance_fraction(np.array([9.0, 0.0])) == 0.0
     far, near = (
-        site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (3.0, -3.0)
+        site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (1.0, -3.0)
     )
     assert (far["site_far_from_hazards"], near["site_far_from_hazards"]) == (True, False)
-    # without a hazard every site is equally far
-    safe[0, 0] = True
-    assert np.isnan(replace(truth, footprints=replace(truth.footprints, safe=safe)).clearance_fraction(np.zeros(2)))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_site_of_an_exact_map_is_the_farthest_from_hazards(seed: int) -> None:
+    """The algorithm's selection, applied to the true safety of random ground with unseen positions."""
+    truth, rng = make_truth(0), np.random.default_rng(seed)
+    safe, covered = (rng.random((9, 9)) < probability for probability in (0.8, 0.9))
+    truth = replace(truth, footprints=replace(truth.footprints, safe=safe), covered=covered)
+    site = safe_site(np.where(truth.safe, Safety.SAFE, Safety.HAZARD).astype(np.uint8), np.array([8.0, 0.0]))
+    assert site is not None
+    assert truth.clearance_fraction(truth.positions[site]) == pytest.approx(1.0)
+
+
+def compute_map_errors(change_map: Callable[[np.ndarray], np.ndarray]) -> dict[str, Scalar]:
+    """Return the errors of a changed map of gently undulating ground with 40 rocks, 0.3 m high, on 8 % of it.
+
+    `change_map` receives the exact elevations of cells of 0.25 m. The map has an additional tilt that does not count.
+    """
+    truth, flight, rng = make_truth(25), make_flight(), np.random.default_rng(3)
+    x, y = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
+    heights = 0.1 * x + 0.03 * np.sin(x) * np.cos(y)
+    for rock in rng.uniform(-5.0, 5.0, (40, 2)):
+        heights[np.hypot(x - rock[0], y - rock[1]) < 0.25] += 0.3
+    truth = replace(truth, relief=Relief(heights, -6.0, -6.0, 0.1))
+    start = flight.states[0].position_m
+    cells = ElevationMap(np.zeros((40, 40)), np.array([-4.875, 4.875]) - start[:2], 0.25)
+    rows, columns = np.indices((40, 40))
+    local = cells.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
+    exact = truth.relief.average(start[:2] + local, 0.25) - start[2]
+    plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
+    ground = make_ground(replace(cells, elevation_m=change_map(exact) + plane), np.zeros((40, 40), dtype=np.uint8))
+    return map_errors(ground, flight, SampledMap.sample(ground, flight, truth, HdaOptions()), truth)
 
 
 @pytest.mark.parametrize(("map_scale", "fraction"), [(0.0, 1.0), (1.0, 0.0), (0.5, 0.5)])
 def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, fraction: float) -> None:
-    """The map contains a fraction of the relief, and an additional tilt that does not count."""
-    truth, flight = make_truth(25), make_flight()
-    start = flight.states[0].position_m
-    cells = ElevationMap(np.zeros((8, 8)), np.array([-3.5, 3.5]) - start[:2], 1.0)
-    rows, columns = np.indices((8, 8))
-    local = cells.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
-    exact = truth.relief.average(start[:2] + local, 1.0) - start[2]
-    plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
-    elevation = replace(cells, elevation_m=map_scale * exact + plane)
-    ground = make_ground(elevation, np.zeros((8, 8), dtype=np.uint8))
-    nothing = np.zeros_like(truth.covered)
-    sampled = SampledMap(nothing, nothing, nothing, np.zeros(nothing.shape))
-    row = map_errors(ground, flight, sampled, truth)
+    row = compute_map_errors(lambda exact: map_scale * exact)
     assert row["relief_error_fraction"] == pytest.approx(fraction, abs=1e-9)
+
+
+def add_gross_errors(exact: np.ndarray) -> np.ndarray:
+    """Shift a fifth of the cells by 1 to 8 m, up or down."""
+    rng = np.random.default_rng(1)
+    shift = rng.uniform(1.0, 8.0, exact.shape) * rng.choice([-1.0, 1.0], exact.shape)
+    return exact + np.where(rng.random(exact.shape) < 0.2, shift, 0.0)
+
+
+def keep_corner(exact: np.ndarray) -> np.ndarray:
+    """Return a map of 2 m x 2 m."""
+    return np.where((np.indices(exact.shape) < 8).all(axis=0), exact, np.nan)
+
+
+@pytest.mark.parametrize(
+    "change_map",
+    [lambda exact: median_filter(exact, 8), add_gross_errors, keep_corner],
+    ids=["without-rocks", "gross-errors", "corner-only"],
+)
+def test_map_without_rocks_or_with_gross_errors_or_of_a_corner_misses_the_bound(
+    change_map: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    (bound,) = {entry.bound for entry in load_campaign("hda-map").definition.requirements}
+    assert bound is not None
+    assert float(compute_map_errors(change_map)["relief_error_fraction"]) > bound
 
 
 def test_answer_without_a_map_has_no_relief_error() -> None:
@@ -209,3 +275,21 @@ def test_true_track_starts_at_the_middle_of_the_summed_rows(error_rows: float) -
     tracks = Tracks(first, second, np.ones(u.size), np.ones(u.size, dtype=np.bool_))
     row = motion_row(HdaDetails((VIEW, VIEW), tracks=tracks), case.flight, case.pair)
     assert row["tracks_correct"] == row["features_in_view"] == u.size
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 30.0])
+def test_both_images_show_the_whole_edge_of_covered_footprints(roll_deg: float) -> None:
+    """64 points on the edge of each footprint, on the relief; image borders are at -0.5 px and size - 0.5 px."""
+    p = LandingScenarioParameters.model_validate(
+        {"terrain": {"samples": 512}, "image_poses": {"heading_deg": 20.0, "roll_deg": roll_deg}}
+    )
+    case = RenderedFlight.simulate(p, Streams(1, "covered", 0))
+    truth = case.truth
+    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    edge_m = 0.5 * truth.limits.diameter_m * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    positions = truth.positions[truth.covered][:, None] + edge_m
+    points = np.concatenate([positions, truth.relief.average(positions, truth.relief.spacing_m)[..., None]], axis=-1)
+    assert len(points) > 100
+    for camera, state in zip(case.pair.cameras, case.flight.states, strict=True):
+        pixels, _ = camera.transform(state.world_from_body).project(points.reshape(-1, 3))
+        assert np.all((pixels >= -0.5) & (pixels <= np.array(camera.size) - 0.5))

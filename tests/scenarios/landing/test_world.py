@@ -61,6 +61,15 @@ def test_plane_has_exact_slope_and_no_roughness() -> None:
     assert not _make_relief(slope=np.tan(np.radians(15.1))).footprints(np.array([[0.0, 0.0]]), LIMITS).safe.any()
 
 
+@pytest.mark.parametrize("side_m", [SPACING_M, 2 * SPACING_M, 8 * SPACING_M, 9 * SPACING_M])
+def test_mean_height_of_a_square_on_a_plane_is_that_of_its_centre(side_m: float) -> None:
+    relief = _make_relief(slope=0.4)
+    relief = Relief(relief.heights_m + 0.1 * relief.heights_m.T, -3.0, -3.0, SPACING_M)
+    points = np.array([[[0.0, 0.0], [1.21, -0.73]]])
+    # cv2 interpolates at multiples of 1/32 point: 0.8 mm / 2 x slope
+    np.testing.assert_allclose(relief.average(points, side_m), points @ [0.4, 0.04], atol=2e-4)
+
+
 def test_block_is_a_hazard_only_inside_the_footprint() -> None:
     relief = _make_relief(slope=0.1, block_height_m=0.3)
     footprints = relief.footprints(np.array([[0.0, 0.0], [1.0, 0.0], [1.2, 0.0]]), LIMITS)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.dynamics.rotorcraft import (
@@ -18,6 +19,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     RotorcraftParameters,
     TransitParameters,
     VibrationParameters,
+    kernels,
     simulate_landing,
     simulate_transit,
 )
@@ -48,6 +50,7 @@ def _fly_landing(
     slope: float = 0.0,
     stuck_m: float | None = None,
     craft: RotorcraftParameters = CRAFT,
+    axis: tuple[float, float, float] = (0.0, 0.0, -1.0),
     **wind: float,
 ) -> RotorcraftFlight:
     """Simulate transit and landing.
@@ -55,6 +58,7 @@ def _fly_landing(
     - east_error_m: constant navigation error to the east
     - slope: slope of the ground, which rises to the east
     - stuck_m: constant reading of a failed laser altimeter
+    - axis: direction of the laser in body axes
     """
     air = _make_air(seed, **wind)
     flight = _fly_transit(air, craft)
@@ -63,7 +67,7 @@ def _fly_landing(
     errors[:, 0] = east_error_m
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
     ground = GroundPatch(float(SITE_XY[0]) - 25.0, float(SITE_XY[1]) - 25.0, 0.5, heights)
-    laser = AltimeterErrors(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
+    laser = AltimeterErrors(1.0, np.zeros(len(air.gusts_m_s)), stuck_m, axis=axis)
     return simulate_landing(flight, GUIDANCE, SITE_XY, errors, air, ground, laser)
 
 
@@ -177,6 +181,31 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
     np.testing.assert_allclose(at_rest.velocity_m_s, 0.0, atol=1e-9)
     np.testing.assert_allclose(at_rest.attitude.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
     assert at_rest.time_s - landed.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
+
+
+def test_altimeter_measures_along_its_axis() -> None:
+    """A laser tilted by 30 deg in calm air reads the height above level ground divided by cos(30 deg)."""
+    heights_m = []
+    for tilt_rad in (0.0, np.radians(30.0)):
+        flight = _fly_landing(craft=NO_VIBRATION, axis=(np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)), **CALM)
+        time = flight.phase_start_s(Phase.FLARE)
+        assert time is not None
+        heights_m.append(flight.path.state(time).position_m[2] - 2.0)
+    # the delay of 0.1 s of both commands, 0.07 m at the speed of the descent
+    assert heights_m[0] == pytest.approx(1.5 - 0.07, abs=0.03)
+    assert heights_m[1] == pytest.approx(1.5 * np.cos(np.radians(30.0)) - 0.07, abs=0.03)
+
+
+def test_range_along_a_tilted_axis_is_that_of_the_rotated_direction() -> None:
+    """Against SciPy's rotation (intrinsic yaw, pitch, roll) on level ground: the height / the downward component."""
+    rng = np.random.default_rng(2)
+    ground = GroundPatch(-50.0, -50.0, 1.0, np.zeros((101, 101)))
+    for _ in range(20):
+        row, angles, axis = np.zeros(18), rng.uniform(-0.4, 0.4, 3), np.append(rng.uniform(-0.3, 0.3, 2), -1.0)
+        axis /= np.linalg.norm(axis)
+        row[2], row[9:12] = 10.0, angles
+        down = -Rotation.from_euler("ZYX", angles).apply(axis)[2]
+        assert kernels.compute_laser_range(ground, row, *axis) == pytest.approx(10.0 / down, rel=1e-12)
 
 
 def test_stuck_altimeter_prevents_deceleration() -> None:
