@@ -72,7 +72,11 @@ COLUMNS = Columns(
             ColumnKind.TRUTH,
         ),
         flag(
-            "hazard_visible", "both images show a footprint that is not safe", "with a visible hazard", ColumnKind.TRUTH
+            "hazard_near_apriori_site",
+            "both images show a footprint that is not safe, and the a-priori site is less than half as far from "
+            "hazards and border as the position that is farthest from them",
+            "with hazards near the a-priori site",
+            ColumnKind.TRUTH,
         ),
         flag(
             "within_limits",

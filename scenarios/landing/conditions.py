@@ -27,8 +27,7 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
     """Classify the flight by its true ground: no safe site, only safe sites without margin, or safe sites with margin.
 
     The ground around a site with margin is safe up to a lander's radius. Exactly one of `no_safe_site_exists`,
-    `narrow_site_exists` and `wide_site_exists` is true. `hazard_visible`: both images show an unsafe footprint, so that
-    not every site is right.
+    `narrow_site_exists` and `wide_site_exists` is true.
     """
     has_safe_site, has_margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
     return {
@@ -36,7 +35,6 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
         "no_safe_site_exists": not has_safe_site,
         "narrow_site_exists": has_safe_site and not has_margin,
         "wide_site_exists": has_margin,
-        "hazard_visible": bool(np.any(truth.visible_hazards)),
     }
 
 
@@ -58,6 +56,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     # for the columns: rotation vector in the body axes at the first image
     body_rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
     body_pitch_deg, body_yaw_deg, body_roll_deg = body_rotation_deg
+    apriori_site_m = (measurements.apriori_site_world - case.flight.position_error_m)[:2]
     within_limits = (
         camera_roll_deg < MAX_ROLL_DEG + _ANGLE_TOLERANCE_DEG
         and max(camera_pitch_deg, camera_yaw_deg) < MAX_TILT_DEG + _ANGLE_TOLERANCE_DEG
@@ -84,6 +83,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **_navigation_errors(case.flight, measurements),
         "covered_m2": float(covered.sum() * truth.step_m**2),
         **site_populations(truth),
+        "hazard_near_apriori_site": truth.has_hazard_near(apriori_site_m),
         "true_safe_fraction": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": bool(within_limits),
         "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else np.nan,

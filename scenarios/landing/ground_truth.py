@@ -20,6 +20,8 @@ STEP_DIAMETERS = 0.1
 MARGIN_DIAMETERS = 1.5
 #: True safety of the footprint around a pixel's ground point: safe, unsafe, or partly outside of an image.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
+#: Minimum clearance of a position far from hazards, as a fraction of the largest clearance.
+MIN_CLEARANCE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,11 @@ class GroundTruth:
         is_outside = distances_m[nearest] > self.step_m
         largest_m = float(clearance_m.max())
         return 0.0 if is_outside or largest_m == 0.0 else float(clearance_m[nearest]) / largest_m
+
+    def has_hazard_near(self, position: Float[np.ndarray, "2"]) -> bool:
+        """Whether both images show a hazard, and a position (x, y) is not far from hazards and border."""
+        is_near = self.clearance_fraction(position) < MIN_CLEARANCE_FRACTION
+        return bool(np.any(self.visible_hazards)) and is_near
 
     def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
         """Compute the distance from a position (x, y) to the nearest unsafe grid position, in both images or not.

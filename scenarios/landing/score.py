@@ -12,7 +12,7 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.hda_stage_columns import motion_errors, stage_row
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.ground_truth import MIN_CLEARANCE_FRACTION, GroundTruth
 from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m
 
@@ -30,8 +30,6 @@ MOTION_COLUMNS = (
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
     "matches_dissimilar", "matches_out_of_bounds", "matches_inconsistent", "empty_fraction", "unknown_fraction",
 )  # fmt: skip
-#: Minimum distance of a site far from hazards, as a fraction of the distance of the farthest position.
-MIN_CLEARANCE_FRACTION = 0.5
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
 GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m", "margin")
 #: Columns of the touchdown, in addition to those of the ground under it.

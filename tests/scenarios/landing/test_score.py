@@ -95,6 +95,17 @@ def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) 
     assert [name for name in populations if row[name]] == [population]
 
 
+def test_hazard_is_near_where_the_clearance_is_below_half_of_the_largest() -> None:
+    truth = make_truth(25)
+    fractions = [truth.clearance_fraction(position) for position in truth.positions.reshape(-1, 2)]
+    is_near = [truth.has_hazard_near(position) for position in truth.positions.reshape(-1, 2)]
+    assert is_near == [fraction < 0.5 for fraction in fractions]
+    assert {True, False} == set(is_near)
+    # only the border: every position is right
+    no_hazard = replace(truth, covered=truth.safe)
+    assert not any(no_hazard.has_hazard_near(position) for position in truth.positions.reshape(-1, 2))
+
+
 def test_flight_without_landing_has_no_touchdown_score() -> None:
     row = landing_row(None, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3))
     assert (row["landed"], row["descent_target_exists"]) == (False, False)
