@@ -148,6 +148,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         sections={section.key: section.data for section in extra_sections},
         showcases=run.stored_cases,
         robustness=evaluation.robustness,
+        repeated=overall_verdict.repeated,
     )
 
 

@@ -104,14 +104,22 @@ def collect_evidence(
     if _describe_problem(frame, verdict):
         return None
     try:
-        masks = [
-            mask(frame, verdict.population)
-            for mask in (populations.population_mask, populations.population_mask_if_answered)
-        ]
+        return _requirement_evidence(verdict, sampling, frame, has_own_terrains=has_own_terrains)
     except ValueError:
         return None
+
+
+def _requirement_evidence(
+    verdict: Verdict, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool
+) -> RequirementEvidence:
+    """Collect the results of all cases (`frame`). Raises ValueError if the rows lack a column of the population."""
+    unfinished = populations.mark_repeated_as_unfinished(frame)
+    masks = (
+        (frame, populations.population_mask(frame, verdict.population)),
+        (unfinished, populations.population_mask_if_answered(unfinished, verdict.population)),
+    )
     return RequirementEvidence(
-        *(_case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains) for mask in masks)
+        *(_case_evidence(verdict, mask, sampling, rows, has_own_terrains=has_own_terrains) for rows, mask in masks)
     )
 
 
@@ -155,26 +163,23 @@ def _evaluate(
     problem = _describe_problem(frame, verdict)
     if problem:
         return replace(verdict, reason=problem)
+    has_own_terrains = earlier is None or earlier.population.labels is None
     try:
-        members = populations.population_mask(frame, verdict.population)
-        members_and_unfinished = populations.population_mask_if_answered(frame, verdict.population)
+        evidence = _requirement_evidence(verdict, sampling, frame, has_own_terrains=has_own_terrains)
     except ValueError as error:
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
-    if not members.any():
+    if not evidence.population.n:
         needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, additional_cases=needed_cases if sampling.independent else None)
-    has_own_terrains = earlier is None or earlier.population.labels is None
-    population, with_unfinished = (
-        _case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains)
-        for mask in (members, members_and_unfinished)
-    )
+    population, with_unfinished = evidence.population, evidence.with_unfinished
+    is_certain = (population.n, population.failures) == (with_unfinished.n, with_unfinished.failures)
     if earlier is not None:
         population = earlier.population.join_own(population)
         with_unfinished = earlier.with_unfinished.join_own(with_unfinished)
     decided = _decide(verdict, population, sampling, frame)
-    if earlier is None and (members == members_and_unfinished).all():
+    if earlier is None and is_certain:
         return decided
     return _withhold_if_uncertain(decided, _decide(verdict, with_unfinished, sampling, frame))
 
@@ -183,16 +188,20 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     """Replace PASS or MET BY RATE by INSUFFICIENT if the verdict changes with unfinished cases as failures.
 
     `valid` and `completed` exclude unfinished cases. Without this check, crashes instead of wrong answers could lead to
-    PASS.
+    PASS. A case that finished in a second attempt counts as unfinished, since repetition would hide a random failure.
     """
     if not verdict.status.is_met or verdict.status is with_unfinished.status:
         return verdict
     n_unfinished = with_unfinished.n - verdict.n
-    reason = (
+    n_repeated = with_unfinished.failures - verdict.failures - n_unfinished
+    text = (
         f"{count(n_unfinished, 'case')} did not finish and {'belongs' if n_unfinished == 1 else 'belong'} to no "
-        f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
-        "withheld."
+        "population of answers."
     )
+    if n_repeated:
+        unfinished = f"{count(n_unfinished, 'case')} did not finish, and " if n_unfinished else ""
+        text = f"{unfinished}{count(n_repeated, 'case')} finished only in a second attempt."
+    reason = f"{text} If they are counted as failures, the verdict is not {verdict.status}. It is therefore withheld."
     return verdict.withhold(reason)
 
 

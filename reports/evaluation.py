@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
+from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
@@ -96,7 +96,7 @@ def evaluate_run(
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(run.record, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     joint = read_joint_evidence(evidence if record is None else replace(evidence, record=str(record)))
-    evidence = replace(evidence, notes=joint.notes)
+    evidence = replace(evidence, notes=(*evidence.notes, *joint.notes))
     columns = read_columns(str(run.definition.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the definition of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
@@ -165,17 +165,21 @@ def _evaluate_study(record: Mapping[str, Any], frame: pd.DataFrame) -> OverallVe
 def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool = True) -> Evidence:
     """Read the kind of evidence of a run from its record.
 
-    A run is not a confirmation if the program changed during the run, or if other requirements than the frozen ones of
-    the campaign are evaluated.
+    If the program changed during the run, the cases are evidence for no program. A run is not a confirmation either if
+    other requirements than the frozen ones of the campaign are evaluated.
     """
     evidence = Evidence.read(record.get("evidence"))
-    if not evidence.is_confirmation:
-        return evidence
     stored_changes = record.get("changes")
-    changes = [str(text) for change in stored_changes or () for text in change.get("in") or ()]
-    if not uses_campaign_requirements:
+    entries = stored_changes if isinstance(stored_changes, list) else []
+    changes = [str(text) for entry in entries for text in table(entry).get("in") or ("unknown",)]
+    if evidence.is_confirmation and not uses_campaign_requirements:
         changes.append("requirements other than those of the campaign")
-    return replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes)) if changes else evidence
+    if not changes:
+        return evidence
+    if evidence.kind in KINDS_WITHOUT_PASS:
+        return replace(evidence, notes=(f"The program changed during the run: {'; '.join(changes)}.",))
+    kind = EvidenceKind.CHANGED if evidence.is_confirmation else EvidenceKind.MIXED
+    return replace(evidence, kind=kind, changes=tuple(changes))
 
 
 def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:

@@ -5,12 +5,12 @@ An undecided campaign also has a remedy: the additional cases that would decide 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pandas as pd
 
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
-from marsyard.reports.populations import engine_failed
+from marsyard.reports.populations import engine_failed, repeated_mask
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics.proportions import minimum_sample_size, proportion_lower
 from marsyard.reports.statistics.sequential import SequentialTest
@@ -122,6 +122,7 @@ class OverallVerdict:
     - without_status: headline if `status` is None
     - is_exploration: whether the run is an exploration, which the headline of PASS states
     - additional_cases: additional cases, all without a failure, that would decide the campaign; None if unknown
+    - repeated: number of cases that finished only in a second attempt
     """
 
     status: Status | None
@@ -130,6 +131,7 @@ class OverallVerdict:
     without_status: str = "NO REQUIREMENT"
     is_exploration: bool = False
     additional_cases: int | None = None
+    repeated: int = 0
 
     @property
     def word(self) -> str:
@@ -146,6 +148,16 @@ def combine_verdicts(
     evidence: Evidence | None = None,
 ) -> OverallVerdict:
     """Return the worst of the verdicts: FAIL, INSUFFICIENT, MET BY RATE, PASS with a qualification, PASS."""
+    overall = _combine_verdicts(verdicts, frame, sampling, evidence)
+    repeated = int(repeated_mask(frame).sum())
+    text = f" {count(repeated, 'case')} finished only in a second attempt." if repeated else ""
+    return replace(overall, sentence=overall.sentence + text, repeated=repeated)
+
+
+def _combine_verdicts(
+    verdicts: Sequence[Verdict], frame: pd.DataFrame, sampling: SamplingDesign, evidence: Evidence | None
+) -> OverallVerdict:
+    """Combine the verdicts, without the number of repeated cases."""
     crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     crash_text = f" {count(crashed, 'case')} crashed." if crashed else ""

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from marsyard.campaigns.outcomes import ENGINE_FAILURES
+from marsyard.campaigns.outcomes import CRASHED, ENGINE_FAILURES
 from marsyard.reports.column_values import numbers
 
 
@@ -59,6 +59,18 @@ def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     if "outcome" not in frame:
         return np.zeros(len(frame), dtype=np.bool_)
     return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
+
+
+def repeated_mask(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    """Create the mask of the finished cases that were run more than once: an earlier attempt may have failed."""
+    is_finished = ~engine_failed(frame) & ("outcome" in frame)
+    return np.asarray((numbers(frame, "case_attempts") > 1.0) & is_finished, dtype=np.bool_)
+
+
+def mark_repeated_as_unfinished(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with the repeated cases as crashed, as if an earlier attempt had been stored."""
+    is_repeated = repeated_mask(frame)
+    return frame.assign(outcome=frame["outcome"].mask(is_repeated, CRASHED)) if is_repeated.any() else frame
 
 
 def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:

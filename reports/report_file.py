@@ -56,6 +56,7 @@ class CampaignReport:
     - showcases: cases with stored products
     - robustness: for each requirement that the rate of the cases meets, the smallest change of each kind to FAIL,
       with the properties `name`, `pass_text` and `fail_text`
+    - repeated: number of cases that finished only in a second attempt
     """
 
     schema: Schema
@@ -85,6 +86,7 @@ class CampaignReport:
     sections: Mapping[str, Mapping[str, Any]]
     showcases: tuple[int, ...]
     robustness: tuple[Robustness, ...] = ()
+    repeated: int = 0
 
     def to_json(self) -> dict[str, Any]:
         """Convert to types of JSON; NaN and infinities become None, folders of the user are hidden."""

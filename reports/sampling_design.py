@@ -11,6 +11,7 @@ import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.campaigns.sampling.design import describe_design
+from marsyard.campaigns.sampling.dispersions import list_sequences
 from marsyard.reports.statistics.sequential import planned_looks, risk_fraction_at
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction
@@ -83,6 +84,7 @@ class SamplingDesign:
 
     - design: `random`, `latin-hypercube` or `sobol`
     - grids: paths of the parameters that were swept as a grid
+    - sequences: paths of the parameters, other than terrains, whose values were used in turn
     - nominal: whether case 0 is the nominal case, with nominal parameters instead of sampled ones
     - max_cases: number of cases at the last look (planned evaluation) of a sequential campaign; otherwise None
     - first_look: number of cases at the first verdict if cases were appended after it; otherwise None
@@ -95,16 +97,17 @@ class SamplingDesign:
     max_cases: int | None = None
     first_look: int | None = None
     terrains: TerrainSupply | None = None
+    sequences: tuple[str, ...] = ()
 
     @property
     def independent(self) -> bool:
         """Whether the cases, except the nominal one, are independent random samples."""
-        return self.design == RANDOM and not self.grids
+        return self.design == RANDOM and not self.grids and not self.sequences
 
     @property
     def text(self) -> str:
         """The design in words."""
-        return describe_design(self.design, self.grids, nominal=self.nominal)
+        return describe_design(self.design, self.grids, self.sequences, nominal=self.nominal)
 
     @property
     def no_probability_reason(self) -> str:
@@ -112,9 +115,10 @@ class SamplingDesign:
         if self.independent:
             return ""
         steps = [] if self.design == RANDOM else ['set design.kind = "random"']
-        remedy = " and ".join([*steps, *(f"define a random distribution for '{path}'" for path in self.grids)])
+        paths = (*self.grids, *self.sequences)
+        remedy = " and ".join([*steps, *(f"define a random distribution for '{path}'" for path in paths)])
         return (
-            f"No probability statement: the design is {describe_design(self.design, self.grids, nominal=False)}, and "
+            f"No probability statement: the design is {replace(self, nominal=False).text}, and "
             f"only independent random samples allow one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
 
@@ -166,4 +170,5 @@ def read_sampling_design(definition: Mapping[str, Any]) -> SamplingDesign:
         max_cases,
         first_look if isinstance(first_look, int) else None,
         read_terrain_supply(definition),
+        list_sequences(dispersions),
     )

@@ -176,7 +176,7 @@ def _read_rows(path: Path, run: StoredRun) -> StoredRun:
     first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
     run = replace(run, frame=first_rows)
     # columns of all cases that verdicts, outcomes and figures use
-    columns = {"case", "outcome", "answered", "terrain", "error", "traceback"}
+    columns = {"case", "outcome", "answered", "terrain", "case_attempts", "error", "traceback"}
     columns.update(column.name for column in enabling_columns(stored_names))
     for requirement in run.requirements:
         columns.update(

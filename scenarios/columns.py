@@ -143,6 +143,7 @@ LEADING = (
     flag("answered", "an answer is given", "with an answer"),
 )
 TRAILING = (
+    Column("case_attempts", ColumnKind.PROVENANCE, "number of times that the case was run"),
     Column("wall_time_s", ColumnKind.PROVENANCE, "wall-clock time of the case"),
     Column("cpu_time_s", ColumnKind.PROVENANCE, "processor time of the case"),
     text("error", "message of a failure", ColumnKind.OUTCOME),

@@ -31,11 +31,14 @@ class EvidenceKind(StrEnum):
     EXPLORATION = "exploration"
     REUSED_SEED = "reused confirmation seed"
     CHANGED = "not the frozen evaluation"
+    MIXED = "mixed programs"
 
 
 #: Kinds of evidence that allow no PASS: the cases were known before the algorithm was frozen, or the evaluation is not
 #: the frozen one.
-KINDS_WITHOUT_PASS = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED})
+KINDS_WITHOUT_PASS = frozenset(
+    {EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED, EvidenceKind.MIXED}
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ class Evidence:
     - registration: why the record was not registered when the run started; empty if it was
     - overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
     - imported_terrain: whether the cases are on an imported DTM, so that no confirmation can use fresh terrains
-    - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases
+    - changes: differences from the frozen algorithm, if the seed was reused; the options set on these cases; or the
+      changes of the program during the run
     - notes: what the record of confirmations shows; determined at each evaluation, not stored
     """
 
@@ -122,6 +126,8 @@ class Evidence:
             "--confirm, on cases that nobody has seen.",
             EvidenceKind.REUSED_SEED: f"The seed belongs to confirmation {self.number}, and the run differs from it: "
             f"{changes}. PASS needs a run with --confirm, which draws a new seed.",
+            EvidenceKind.MIXED: f"The program changed during the run: {changes}. The cases are not those of one "
+            "program; PASS needs a new run.",
             EvidenceKind.CHANGED: f"Not the frozen evaluation: {changes}. PASS needs a run with --confirm.",
         }[self.kind]
         return " ".join((text, *self._terrain_texts(), *self.notes))

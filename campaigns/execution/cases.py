@@ -75,7 +75,7 @@ def run_case(
     """
     wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
-    point, draws = points.get(case), {}
+    point, draws, is_repeatable = points.get(case), {}, False
     try:
         campaign = _load_campaign(definition)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
@@ -90,12 +90,14 @@ def run_case(
         row = make_finished_row(case, result, draws, campaign.definition.requirements)
         products = result.products
     except BaseException as error:
+        # a scenario returns the failure of its algorithm as a row, which is final
+        is_repeatable = True
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
         row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), draws)
     wall_time_s, cpu_time_s = time.perf_counter() - wall_start_s, time.process_time() - cpu_start_s
     row = {**row, "wall_time_s": wall_time_s, "cpu_time_s": cpu_time_s}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
-        worker_process.request_fresh_worker()
+        worker_process.request_fresh_worker(is_repeatable=is_repeatable)
     if not products or not selection.selects(row):
         return CompletedCase(row)
     try:
@@ -142,7 +144,8 @@ def run_cases(
                 {**_build_terminated_row(definition, task_result, point), **times}
             )
             note = "; ".join(filter(None, (case_result.note, *_describe_changes(task_result, note_counts))))
-            row = case_result.row if point is None else {**case_result.row, POINT_COLUMN: point.text}
+            row = {**case_result.row, "case_attempts": task_result.attempts}
+            row = row if point is None else {**row, POINT_COLUMN: point.text}
             completed_cases.append(replace(case_result, row=row, note=note))
         yield completed_cases
 

@@ -165,6 +165,7 @@ class _BatchQueue:
         self._batches = Batches(work.items, work.total, 1)
         self._repeated: deque[Sequence[int]] = deque()
         self._abandoned: Counter[int] = Counter()
+        self._divided: set[int] = set()
         self._futures: dict[Any, Sequence[int]] = {}
         self._completed = cluster.create_queue()
         self._threads, self._executors = 0, 1
@@ -237,10 +238,12 @@ class _BatchQueue:
             is_abandoned = False
         else:
             self._batches.record_time(len(batch), seconds)
-            return list(results)
+            return [replace(result, attempts=result.attempts + (result.item in self._divided)) for result in results]
         if is_abandoned and self._count_abandoned(batch) <= _MAX_ABANDONED:
             self._repeated.append(batch)
         elif len(batch) > 1:
+            # each of its items may have ended the Dask workers
+            self._divided.update(batch)
             self._repeated.extend((item,) for item in batch)
         else:
             return [TaskResult(batch[0], None, WorkerExitError(CRASHED, "its Dask workers died in succession", ""))]

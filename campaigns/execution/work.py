@@ -17,8 +17,9 @@ class TaskResult(Generic[Result]):
 
     - changed: names of the parts of the process state that the task changed
     - crashed: whether the task requested a fresh worker (`request_fresh_worker`)
-    - previous_item: only for a crashed item: item that ran before in the same process; None for the first item
+    - previous_item: item that ran before in the same process and may have caused the crash; None without such a crash
     - crashed_only_after: predecessor item needed to reproduce the crash; the item does not crash in a fresh process
+    - attempts: number of attempts to run the item; only the result of the last one is known
     """
 
     item: int
@@ -28,6 +29,7 @@ class TaskResult(Generic[Result]):
     crashed: bool = False
     previous_item: int | None = None
     crashed_only_after: int | None = None
+    attempts: int = 1
 
 
 @dataclass(frozen=True)

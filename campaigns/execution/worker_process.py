@@ -82,6 +82,7 @@ class _WorkerContext:
     - trace: file of the stack trace
     - output: descriptor of the output file
     - item, crashed: latest item, and whether it requested a fresh worker
+    - is_repeatable: whether an earlier item may have caused the crash
     - files: open descriptors that an item must not close, with their identities
     """
 
@@ -92,6 +93,7 @@ class _WorkerContext:
     item: int | None = None
     state: process_state.ProcessState = field(default_factory=process_state.ProcessState)
     crashed: bool = False
+    is_repeatable: bool = False
 
 
 _context: _WorkerContext | None = None
@@ -186,20 +188,25 @@ def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
                 stream.flush()
         if os.fstat(_context.output).st_size > 0:
             os.ftruncate(_context.output, 0)
-        previous_item, _context.item, _context.crashed = _context.item, item, False
+        previous_item, _context.item = _context.item, item
+        _context.crashed = _context.is_repeatable = False
         _context.board.write(item)
     try:
         result = TaskResult(item, task(item), None)
     except Exception as error:
         result = TaskResult(item, None, error)
-    has_crashed = _context is not None and _context.crashed
-    return replace(result, crashed=True, previous_item=previous_item) if has_crashed else result
+    if _context is None or not _context.crashed:
+        return result
+    return replace(result, crashed=True, previous_item=previous_item if _context.is_repeatable else None)
 
 
-def request_fresh_worker() -> None:
-    """Request a fresh process for the next item, because the current item crashed and may have damaged the process."""
+def request_fresh_worker(*, is_repeatable: bool) -> None:
+    """Request a fresh process for the next item, because the current item crashed and may have damaged the process.
+
+    is_repeatable: whether an earlier item of the process may have caused the crash; the item then runs again
+    """
     if _context is not None:
-        _context.crashed = True
+        _context.crashed, _context.is_repeatable = True, is_repeatable
 
 
 def accept_process_state() -> None:

@@ -13,7 +13,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, suppress
@@ -32,9 +32,9 @@ from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT
 
 Result = TypeVar("Result")
 
-#: Number of attempts before a crash or lack of memory, or a time limit exceeded by a suspended process, is attributed
-#: to the task; the last attempt is in a fresh worker. An earlier task may have damaged the worker or used its memory,
-#: or an external process may have killed or stopped the worker.
+#: Number of attempts before the death of a worker, or a time limit exceeded by a suspended process, is attributed to
+#: the task; the last attempt is in a fresh worker. An earlier task may have damaged the worker or used its memory, or
+#: an external process may have killed or stopped it. The task itself may be the cause, so attempts are counted.
 _MAX_ATTEMPTS = 2
 #: Maximum number of consecutive deaths of each worker before it starts a task, and the pause after the first, s; each
 #: pause is twice as long as the previous one, because a lack of memory or processes on the machine can be temporary.
@@ -92,7 +92,7 @@ class _WorkProgress:
         self._memory_bytes = memory_bytes
         self._idle = deque(workers)
         self._retries: deque[list[int]] = deque()
-        self._attempts: dict[int, int] = {}
+        self._repetitions: Counter[int] = Counter()
         self._suspect_predecessors: dict[int, int | None] = {}
         self._running: dict[Future[Any], tuple[MonitoredWorker, Sequence[int]]] = {}
         # consecutive deaths before a task, and end of the pause (monotonic clock, s), by worker
@@ -109,7 +109,11 @@ class _WorkProgress:
                 time.sleep(POLL_INTERVAL_S)
                 continue
             futures, _ = wait(self._running, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
-            results = [result for future in futures for result in self._collect(future)]
+            results = [
+                replace(result, attempts=1 + self._repetitions.pop(result.item, 0))
+                for future in futures
+                for result in self._collect(future)
+            ]
             for worker, _ in self._running.values():
                 worker.enforce_limits(self._work.limits, self._memory_bytes, self._batches.max_duration_s)
             if results:
@@ -147,12 +151,13 @@ class _WorkProgress:
         self._idle.append(worker)
         if is_ambiguous or len(batch) > 1:
             # one of its items may have exceeded the time limit, or one of its results cannot be pickled
+            self._repetitions.update(batch)
             self._retries.extend([item] for item in batch)
             return []
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
     def _handle_batch_result(self, worker: MonitoredWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
-        """Return the final results of a batch; an item that crashed after others runs again in a fresh process."""
+        """Return the final results of a batch; an item that an earlier one may have crashed runs again."""
         if batch_result.not_started:
             self._retries.append(list(batch_result.not_started))
         if batch_result.results:
@@ -165,6 +170,7 @@ class _WorkProgress:
         for suspect in crashed_results:
             # there is at most one, the last item of the batch; it runs again in the fresh process
             self._suspect_predecessors[suspect.item] = suspect.previous_item
+            self._repetitions[suspect.item] += 1
             self._submit(worker, [suspect.item])
         if not crashed_results:
             self._idle.append(worker)
@@ -179,7 +185,11 @@ class _WorkProgress:
     def _handle_worker_crash(
         self, worker: MonitoredWorker, batch: Sequence[int], error: BaseException
     ) -> list[TaskResult[Any]]:
-        """Identify the task that ended the worker; run the other tasks of its batch again."""
+        """Identify the task that ended the worker; run the other tasks of its batch again.
+
+        Results of earlier tasks of the batch are lost with the worker. Their repetition does not count, since it does
+        not depend on these results.
+        """
         death = worker.handle_death(error)
         item, exit_error = death.item, death.error
         if item is None:
@@ -194,15 +204,15 @@ class _WorkProgress:
         index = batch.index(item)
         if exit_error.outcome == TIMED_OUT and len(batch) > 1:
             # the time of an item is measured only if it runs alone
+            self._repetitions[item] += 1
             self._retries.extend([started] for started in batch[: index + 1])
             self._retries.extend([list(batch[index + 1 :])] if batch[index + 1 :] else [])
             self._idle.append(worker)
             return []
         self._retries.extend(list(part) for part in (batch[:index], batch[index + 1 :]) if part)
-        attempt = self._attempts.pop(item, 1)
         is_uncertain = exit_error.outcome in (CRASHED, OUT_OF_MEMORY) or death.was_suspended
-        if is_uncertain and attempt < _MAX_ATTEMPTS:
-            self._attempts[item] = attempt + 1
+        if is_uncertain and 1 + self._repetitions[item] < _MAX_ATTEMPTS:
+            self._repetitions[item] += 1
             self._submit(worker, [item])
             return []
         self._idle.append(worker)

@@ -1,9 +1,9 @@
 """Campaign engine: run a campaign in a folder, resume it, or append cases; store rows and products."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,8 @@ def resume_campaign(
 ) -> None:
     """Run the cases of a stored campaign that have no row yet; the rows of finished cases do not change.
 
-    - retry: keys of `RETRYABLE`; cases with these outcomes run again, and their new rows replace the old rows
+    - retry: keys of `RETRYABLE`; cases with these outcomes run again, and their new rows replace the old rows; the
+      attempts of old and new rows are added
     - case_time_s: time limit of the remaining cases instead of the campaign's
     - allow_changed: continue with another program or other versions, and record the differences
 
@@ -211,7 +212,7 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
             if missing or retries:
                 compile_kernels(executor, definition.scenario, run.observer.note)
                 prepare_inputs(run.campaign, executor, run.observer, itertools.chain(*missing, retries))
-                _run_cases(run, store, executor, [*missing, retries])
+                _run_cases(run, store, executor, missing, retries)
             write_table(table, store, numeric_metrics(definition.requirements))
             if run.shard is None:
                 _rerun_for_products(run, store, executor)
@@ -230,15 +231,19 @@ def _list_missing_cases(run: _CampaignRun, store: RowStore) -> list[range]:
     return [part for part in limited if part]
 
 
-def _run_cases(run: _CampaignRun, store: RowStore, executor: Executor, case_groups: Sequence[Sequence[int]]) -> None:
+def _run_cases(
+    run: _CampaignRun, store: RowStore, executor: Executor, missing: Sequence[Sequence[int]], retries: Sequence[int]
+) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
     definition, observer = run.campaign.definition, run.observer
-    total = sum(len(group) for group in case_groups)
+    total = sum(len(group) for group in (*missing, retries))
     products = ProductStore(run.directory, definition.retain.budget_gb)
-    cases = itertools.chain.from_iterable(case_groups)
+    cases = itertools.chain(*missing, retries)
+    earlier_attempts = {case: int((store.row(case) or {}).get("case_attempts", 1)) for case in retries}
     observer.begin("cases", total)
     is_checked = False
     for batch in run_cases(executor, definition, cases, selection=create_product_selection(definition), total=total):
+        batch = [_add_attempts(completed, earlier_attempts) for completed in batch]
         for completed in batch:
             _store_products(products, completed, observer)
         store.add(completed.row for completed in batch)
@@ -248,6 +253,13 @@ def _run_cases(run: _CampaignRun, store: RowStore, executor: Executor, case_grou
             is_checked = True
         for _ in batch:
             observer.step()
+
+
+def _add_attempts(completed: CompletedCase, earlier_attempts: Mapping[int, int]) -> CompletedCase:
+    """Add the attempts of the stored row that the new row replaces."""
+    row = completed.row
+    attempts = int(row["case_attempts"]) + earlier_attempts.get(int(row["case"]), 0)
+    return replace(completed, row={**row, "case_attempts": attempts})
 
 
 def _store_products(products: ProductStore, completed: CompletedCase, observer: ProgressObserver) -> None:

@@ -26,7 +26,7 @@ class Replay:
     """A case that was run again.
 
     - row, stored: new row and stored row of the case (None if no row is stored)
-    - differing: columns in which the two rows differ, except those with `time` in their name
+    - differing: columns in which the two rows differ, except attempts and columns with `time` in their name
     - products: products for figures; None if the scenario returned none, or none that can be stored
     - note: reason why there are no products; empty without a problem
     - changed: differences in definition, code and package versions from the stored campaign
@@ -89,11 +89,11 @@ def replay_in_executor(
 
 
 def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
-    """List the columns in which two rows are not bit-identical, except times; a missing number equals NaN.
+    """List the columns in which two rows are not bit-identical, except times and attempts; NaN equals a missing number.
 
     The traceback of an unfinished case is not compared, since a process is not always terminated at the same line.
     """
-    excluded_columns = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
+    excluded_columns = {"case_attempts"} | ({"traceback"} if row.get("outcome") in ENGINE_FAILURES else set())
     differing = []
     for name in dict.fromkeys((*row, *stored)):
         # NaN differs from itself

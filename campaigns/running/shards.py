@@ -58,8 +58,10 @@ def read_shard(stored: dict[str, Any]) -> Shard | None:
     return None if text is None else Shard.parse(str(text))
 
 
-def merge_shards(directories: Sequence[Path], target: Path) -> None:
+def merge_shards(directories: Sequence[Path], target: Path, *, allow_changed: bool = False) -> None:
     """Create a campaign from the rows and products of all its shards; its table and report are not written yet.
+
+    allow_changed: merge shards whose program or versions changed while they were run; the record lists these changes
 
     The folder of the campaign appears when it is complete: an interrupted merge leaves nothing that a new one rejects.
     Raises CampaignError, and changes nothing, if a folder is no finished shard, the shards are of different campaigns,
@@ -82,6 +84,11 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
         if changes:
             raise CampaignError(
                 f"{directory} and {directories[0]} differ in {', '.join(changes)}: rows cannot be merged"
+            )
+        if stored["changes"] and not allow_changed:
+            raise CampaignError(
+                f"{directory} was continued with another program or other versions. To merge it nevertheless, with a "
+                "note in the record: --allow-changed"
             )
         for case in shard.cases(stored["cases"]):
             if case in covered:
@@ -106,6 +113,7 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
         started = min(stored["started_utc"] for stored in records)
         # like an interrupted run, the campaign lacks its table and report, which `continue_campaign` writes
         updates = {"sessions": sessions, "started_utc": started, "state": "interrupted", "merged": len(directories)}
+        updates["changes"] = [change for stored in records for change in stored["changes"]]
         record.write(folder, {**{key: value for key, value in first.items() if key != SHARD_KEY}, **updates})
 
 

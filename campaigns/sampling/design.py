@@ -145,8 +145,8 @@ def compute_grid_quantiles(sizes: Mapping[str, int], point: int) -> dict[str, fl
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
 
 
-def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
-    """Describe a sampling design in words."""
+def describe_design(kind: str, grids: Sequence[str], sequences: Sequence[str] = (), *, nominal: bool) -> str:
+    """Describe a sampling design in words; for `sequences` see `marsyard.campaigns.sampling.dispersions`."""
     names = {
         "random": "random draws",
         "latin-hypercube": "Latin hypercube",
@@ -154,8 +154,10 @@ def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
         "adaptive": "points chosen by a study",
     }
     text = names.get(kind, kind)
-    if kind == "random" and not grids:
+    if kind == "random" and not grids and not sequences:
         text = f"independent {text}"
     if grids:
         text += f" at each point of a grid over {', '.join(grids)}"
+    if sequences:
+        text += f" with values in turn of {', '.join(sequences)}"
     return f"{text}; case 0 is the nominal case" if nominal else text

@@ -4,6 +4,7 @@
 import bisect
 import itertools
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -263,7 +264,8 @@ class CyclicInteger(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
     No number repeats before all numbers have occurred; for example, a campaign then uses as many terrains as possible.
-    If the number only selects one of many independent terrains, cases with different numbers are independent. Several
+    If the number only selects one of many independent terrains, cases with different numbers are independent; with any
+    other number they are not (`list_sequences`). Several
     cases of a study can have the same random streams: they have the same number, that of these streams in the sequence.
     """
 
@@ -277,6 +279,25 @@ class CyclicInteger(_WholeNumbers):
     def value(self, case: int) -> int:
         """Return the number of a case; in a study, `case` is the number of the case's random streams."""
         return int(self.low) + case % self.size
+
+
+def list_sequences(dispersions: Mapping[str, Any]) -> tuple[str, ...]:
+    """List the paths of the dispersions `in-turn` whose cases are no independent draws.
+
+    Only the number of a terrain (parameter `terrain`) selects an independent object, which has random streams of its
+    own. Any other number, and one in a formula, is a quantity of which the cases use the first values of the range.
+
+    dispersions: tables of the dispersions by path, as in a campaign file
+    """
+    tables = {path: item for path, item in dispersions.items() if isinstance(item, Mapping)}
+    texts = [str(value) for item in tables.values() for key, value in item.items() if key != "source"]
+
+    def is_in_formula(path: str) -> bool:
+        pattern = re.compile(rf"(?<![\w.]){re.escape(path)}(?![\w.])")
+        return any(pattern.search(text) for text in texts)
+
+    paths = [path for path, item in tables.items() if item.get("distribution") == "in-turn"]
+    return tuple(path for path in paths if path.rpartition(".")[2] != "terrain" or is_in_formula(path))
 
 
 class Scipy(base.Dispersion):

@@ -27,6 +27,7 @@ from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.study_points import StudyPoint, number_blend
 from marsyard.campaigns.studies import subset
@@ -89,6 +90,7 @@ class _RareStudy:
     """A running study.
 
     - violations: number of violations among all cases
+    - repeated: number of finished cases that were run more than once
     - is_violation, terrains: violation and terrain of each independent case of the nominal distribution
     - reserved_cases: number of random cases, out of the limit of cases, that are not yet run
     """
@@ -96,7 +98,7 @@ class _RareStudy:
     def __init__(self, campaign: Campaign, parameters: RareParameters, runner: PointRunner) -> None:
         self._campaign, self._parameters, self._runner = campaign, parameters, runner
         self._requirement: Requirement = find_requirement(campaign, parameters.requirement)
-        self._violations = 0
+        self._violations = self._repeated = 0
         self._is_violation: list[bool] = []
         self._terrains: list[str | None] = []
         self._reserved_cases = sum(parameters.random_cases)
@@ -208,6 +210,8 @@ class _RareStudy:
         rows = self._runner.run(points, self._reserved_cases)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
+        finished = [row for row in rows if row["outcome"] not in ENGINE_FAILURES]
+        self._repeated += sum(int(row.get("case_attempts", 1)) > 1 for row in finished)
         numbered = [number_blend(blend, case) for case, blend in enumerate(blends, start=first)]
         ends = np.cumsum([len(group.blends) for group in proposals])
         evaluated: list[subset.Evaluated] = []
@@ -227,14 +231,20 @@ class _RareStudy:
     def _decide(
         self, results: Sequence[subset.SubsetResult], violation_weights: Sequence[float] | None, shortfall: str
     ) -> Decision:
-        """Decide the verdict; a PASS becomes INSUFFICIENT on a seed from which the algorithm's options were set."""
+        """Decide the verdict.
+
+        A PASS becomes INSUFFICIENT on a seed from which the algorithm's options were set, and with repeated cases: the
+        cases of a subset simulation depend on each other, so the effect of a hidden failure is unknown.
+        """
         parameters, evidence = self._parameters, self._runner.evidence
         sample = RareSample(
             results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
         )
         evaluations = len(parameters.replicates)
         decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
-        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
-            reason = f"The verdict would be PASS. {evidence.text}"
+        repeated = f"{self._repeated:,} cases finished only in a second attempt." if self._repeated else ""
+        obstacle = evidence.text if evidence.excludes_pass else repeated
+        if decision.verdict is RareVerdict.PASS and obstacle:
+            reason = f"The verdict would be PASS. {obstacle}"
             decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
         return decision

@@ -25,7 +25,7 @@ from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.shared_inputs import prepare_inputs
 from marsyard.campaigns.running.stored_campaign import create_files, load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
-from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
+from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion, list_sequences
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock, lock_new_folder
 from marsyard.campaigns.store.origin import check_rows
@@ -58,15 +58,19 @@ class StudySession(Generic[Parameters, Result]):
 def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = None) -> Campaign:
     """Return the campaign with the design `adaptive` and at most `max_cases` cases.
 
-    A number `in-turn` that does not repeat within the `streams` of the study (one per case by default) belongs to the
-    random streams: it follows their number.
+    The number of a terrain `in-turn` that does not repeat within the `streams` of the study (one per case by default)
+    belongs to the random streams: it follows their number.
     Raises CampaignError if a dispersion is neither a standard normal variable nor such a number.
     """
     definition = campaign.definition
+    sequences = list_sequences(definition.model_dump(mode="json")["dispersions"])
     for path, dispersion in definition.dispersions.items():
         remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
         if isinstance(dispersion, GridDispersion):
             raise CampaignError(f"dispersions.{path}: is a distribution 'grid', which has no probabilities; {remedy}")
+        if path in sequences:
+            reason = "is a distribution 'in-turn' of a number that selects no terrain, or that a formula uses"
+            raise CampaignError(f"dispersions.{path}: {reason}; {remedy}")
         if isinstance(dispersion, CyclicInteger):
             inputs = {name: value_at(definition.parameters, name) for name in dispersion.names}
             size, used = dispersion.insert_values(inputs).size, streams or max_cases

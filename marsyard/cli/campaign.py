@@ -146,6 +146,7 @@ def merge(
     directories: Annotated[list[Path], Argument(metavar="DIR...", help="Folders of all shards of a campaign.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the merged campaign.")],
     jobs: options.JobsOption = None,
+    allow_changed: options.ChangedOption = False,
     trust: options.TrustOption = False,
 ) -> None:
     """Combine all shards of a campaign (`run --shard`) into one campaign, evaluate it, and write its report."""
@@ -153,7 +154,7 @@ def merge(
     from marsyard.campaigns.running.shards import merge_shards
     from marsyard.campaigns.store.origin import adopt
 
-    merge_shards(directories, out)
+    merge_shards(directories, out, allow_changed=allow_changed)
     if trust:
         adopt(out)
     executor = make_executor(jobs, None)

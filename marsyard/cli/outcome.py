@@ -84,12 +84,14 @@ def _describe_unfinished(directory: Path, stored: Mapping[str, Any]) -> str:
 def evaluate_and_store(directory: Path, requirements: Requirements | None = None) -> tuple[Evaluation, Path]:
     """Evaluate a campaign's rows and write its report; return the evaluation and the path of the report.
 
-    The exit status of a finished campaign is stored in its record, unless `requirements` replace its requirements.
+    The exit status of a finished campaign and its number of repeated cases are stored in its record, unless
+    `requirements` replace its requirements.
     Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     evaluation = evaluate_run(directory, requirements)
     if requirements is None and evaluation.run.recorded("state") == "finished":
-        record.update(directory, {"exit_code": evaluation.exit_code})
+        repeated = evaluation.overall_verdict.repeated
+        record.update(directory, {"exit_code": evaluation.exit_code, "cases_repeated": repeated})
         record_look(evaluation)
     with report_write_errors("the report"):
         return evaluation, write_evaluation(evaluation)

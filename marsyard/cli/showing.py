@@ -17,7 +17,7 @@ from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.parameter_paths import leaves, value_at
 from marsyard.campaigns.definition.toml_models import description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
-from marsyard.campaigns.sampling.design import describe_design
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.wording import count, requirement_text
 from marsyard.scenarios.columns import split_unit
 
@@ -101,7 +101,7 @@ def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
     """Convert a campaign to plain data, optionally with the draws of its first cases; infinite bounds become None."""
     definition = campaign.definition
     data: dict[str, Any] = definition.model_dump(mode="json")
-    data["design"]["text"] = _sampling_text(definition)
+    data["design"]["text"] = read_sampling_design(definition.model_dump(mode="json")).text
     data["dispersions"] = [_dispersion_data(campaign, path) for path in definition.dispersions]
     if cases is not None:
         values_by_path = list_drawn_values(campaign, cases)
@@ -159,14 +159,9 @@ def _print_header(definition: CampaignDefinition, console: Console) -> None:
     for line in (
         f"{definition.name}: {definition.description}",
         f"scenario {definition.scenario}, {count(definition.total_cases, 'case')}, seed {definition.seed}",
-        f"sampling: {_sampling_text(definition)}",
+        f"sampling: {read_sampling_design(definition.model_dump(mode='json')).text}",
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _sampling_text(definition: CampaignDefinition) -> str:
-    design = definition.design
-    return describe_design(design.kind, list(definition.grids), nominal=design.nominal)
 
 
 def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:

@@ -163,6 +163,15 @@ def test_changed_code_invalidates_a_confirmation(marsyard: Command, tmp_path: Pa
     path.write_text(json.dumps(record))
     output = marsyard("report", "run-1")
     assert (output.status, "code (abc, now def)" in output.text) == (3, True)
+    # also an exploration and a calibration
+    for kind, title in (("exploration", "mixed programs"), ("calibration", "calibrated on these cases")):
+        path.write_text(json.dumps(record | {"evidence": {"kind": kind}}))
+        output = marsyard("report", "run-1")
+        assert (output.status, "code (abc, now def)" in output.text) == (3, True)
+        assert "code (abc, now def)" in (tmp_path / "run-1" / "report.html").read_text()
+        report = json.loads((tmp_path / "run-1" / "report.json").read_text())
+        assert (report["verdict"], report["evidence"]["title"]) == ("INSUFFICIENT", title)
+        assert "code (abc, now def)" in report["evidence"]["text"]
 
 
 def test_other_requirements_invalidate_a_confirmation(marsyard: Command, tmp_path: Path) -> None:

@@ -18,10 +18,16 @@ from marsyard.reports.verdicts import Status
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 GRID = {"a": {"distribution": "grid", "values": [1, 2]}, "b": {"distribution": "uniform", "low": 0, "high": 1}}
+IN_TURN = {"distribution": "in-turn", "low": 0, "high": "a.bank - 1", "source": "a.terrain is a number"}
 DESIGNS = [
     ({"design": {"kind": "latin-hypercube"}}, "the design is Latin hypercube, and only independent random samples"),
     ({"design": {"kind": "sobol"}}, "the design is scrambled Sobol, and only"),
     ({"dispersions": GRID}, "the design is random draws at each point of a grid over a, and only"),
+    ({"dispersions": {"k": IN_TURN}}, "the design is random draws with values in turn of k, and only"),
+    (
+        {"dispersions": {"a.terrain": IN_TURN, "b": {"distribution": "derived", "formula": "2 * a.terrain"}}},
+        "values in turn of a.terrain, and only",
+    ),
 ]
 
 
@@ -31,6 +37,11 @@ DESIGNS = [
 def test_default_design_is_independent_draws(values: dict[str, Any]) -> None:
     assert read_sampling_design(values) == INDEPENDENT
     assert INDEPENDENT.no_probability_reason == ""
+
+
+def test_terrains_in_turn_are_independent_draws() -> None:
+    dispersions = {"a.terrain": IN_TURN, "b": {"distribution": "derived", "formula": "2 * a.terrain_size"}}
+    assert read_sampling_design({"dispersions": dispersions}).independent
 
 
 @pytest.mark.parametrize(("definition", "message"), DESIGNS)

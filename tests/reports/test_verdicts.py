@@ -189,6 +189,15 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
     assert evaluate(few_crashes, requirement, population=population).status is Status.PASS
+    # cases that finished only in a second attempt count like crashed ones
+    repeated = make_cases(50, 0).assign(is_near=True, case_attempts=np.where(np.arange(50) < 10, 2, 1))
+    for rule in ("confidence", "estimate"):
+        verdict = evaluate(repeated, requirement, population=population, decide_by=rule)
+        assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 50, 0)
+        assert verdict.note.startswith("10 cases finished only in a second attempt.")
+    assert evaluate(repeated, requirement, population="all").status is Status.INSUFFICIENT
+    assert evaluate(repeated.assign(is_near=repeated["case"] >= 10), requirement, population="is_near").n == 40
+    assert evaluate(few_crashes.assign(case_attempts=2 - few_crashes["answered"]), requirement).status is Status.PASS
     outside_population = frame.assign(is_near=frame["answered"])
     assert evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
 
@@ -313,6 +322,14 @@ def test_crashed_cases_are_counted_in_the_summary() -> None:
     summary = combine_verdicts([], make_rows(24, n_crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence
+
+
+def test_repeated_cases_are_counted_in_the_summary() -> None:
+    frame = make_cases(20, 0).assign(outcome=["CRASHED"] + ["VALID"] * 19, case_attempts=[2] * 3 + [1] * 17)
+    overall = combine_verdicts([evaluate(frame, VELOCITY)], frame)
+    # the crashed case is no repeated one: it crashed again
+    assert (overall.crashed, overall.repeated) == (1, 2)
+    assert overall.sentence.endswith("1 case crashed. 2 cases finished only in a second attempt.")
 
 
 def test_population_defined_by_truth_is_named_and_compared_with_all_cases() -> None:

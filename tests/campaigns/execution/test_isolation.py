@@ -249,10 +249,10 @@ def test_import_in_a_case_is_no_change_by_the_case(tmp_path: Path, monkeypatch: 
     assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere"), (None, None, "/somewhere")]
 
 
-def crash_after_other_case(item: int) -> int:
+def crash_after_other_case(is_repeatable: bool, item: int) -> int:
     """Report a crash if the previous item ran in this process, or in item 3. `_worker_state` is not restored."""
     if item in _worker_state or item == 3:
-        request_fresh_worker()  # marks the item as crashed
+        request_fresh_worker(is_repeatable=is_repeatable)  # marks the item as crashed
         return -1
     _worker_state.append(item + 1)
     time.sleep(0.01)
@@ -262,11 +262,20 @@ def crash_after_other_case(item: int) -> int:
 @pytest.mark.slow
 def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     _worker_state.clear()
-    results = run_items(crash_after_other_case, range(5))
+    results = run_items(partial(crash_after_other_case, True), range(5))
     assert list_results(results) == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
+    assert [results[item].attempts for item in range(5)] == [1, 2, 2, 2, 1]
     # crashed_only_after names the earlier case; case 3 crashes in a fresh worker too
     assert [results[item].crashed_only_after for item in range(5)] == [None, 0, 1, None, None]
     assert [results[item].crashed for item in range(5)] == [False, False, False, True, False]
+
+
+def test_crash_of_the_algorithm_is_final() -> None:
+    _worker_state.clear()
+    results = run_items(partial(crash_after_other_case, False), range(5))
+    # the worker is replaced after each crash
+    assert list_results(results) == {0: 0, 1: -1, 2: 2, 3: -1, 4: 4}
+    assert {(result.attempts, result.crashed_only_after) for result in results.values()} == {(1, None)}
 
 
 def share_memory(item: int) -> int:

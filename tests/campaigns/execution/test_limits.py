@@ -77,6 +77,7 @@ def test_suspended_worker_repeats_its_case(tmp_path: Path) -> None:
     assert list_results(results) == {0: 0, 1: 1, 2: 2}
     first, second = read_starts(tmp_path, 1)
     assert first != second
+    assert results[1].attempts == 2
 
 
 def test_case_that_is_too_slow_without_suspension_runs_once(tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ def test_number_of_worker_processes_is_respected() -> None:
 def test_task_of_killed_worker_is_repeated(tmp_path: Path) -> None:
     results = run_items(partial(abort_once, str(tmp_path / "marker")), range(6), jobs=2)
     assert list_results(results) == {item: item for item in range(6)}
+    assert [results[item].attempts for item in range(6)] == [1, 2, 1, 1, 1, 1]
 
 
 def test_errors_are_assigned_to_their_tasks() -> None:
@@ -129,6 +130,7 @@ def test_only_tasks_that_exceed_a_limit_are_ended(tmp_path: Path) -> None:
     # several is measured in a second run
     starts = {item: len((tmp_path / str(item)).read_text()) for item in (1, 2, 3, 4)}
     assert starts == {1: 2, 2: 2, 3: 1, 4: 2}
+    assert {item: results[item].attempts for item in starts} == starts
 
 
 def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (the list imitates a memory leak)

@@ -84,6 +84,8 @@ def test_crashed_cases_are_repeated_on_request(finished_campaign: Path, watch: R
     resume_campaign(finished_campaign, ExecutorConfig(1), watch, retry=["crashed"])
     times_after_retry = {row["case"]: row["wall_time_s"] for row in read_case_rows(finished_campaign)}
     assert [case for case in times if times_after_retry[case] != times[case]] == [2]
+    # the first run repeats the exception of the scenario in a fresh worker, the second run has only this case
+    assert [row["case_attempts"] for row in read_case_rows(finished_campaign)] == [1, 1, 3, 1]
 
 
 def test_changed_versions_are_rejected_without_allow_changed(

@@ -105,6 +105,18 @@ def test_changed_shard_is_rejected(shards: list[Path], tmp_path: Path) -> None:
     assert not (tmp_path / "merged").exists()
 
 
+def test_changes_of_all_shards_are_merged_on_request(shards: list[Path], tmp_path: Path) -> None:
+    copies = [shutil.copytree(shard, tmp_path / shard.name) for shard in shards]
+    changes = [{"utc": "", "cases_before": 1, "in": [f"code ({number}, now 9)"]} for number in (1, 2)]
+    record.update(copies[1], {"changes": changes[:1]})
+    record.update(copies[3], {"changes": changes[1:]})
+    with pytest.raises(CampaignError, match=r"shard-2 was continued with another program .*--allow-changed"):
+        merge_shards(copies, tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+    merge_shards(copies, tmp_path / "merged", allow_changed=True)
+    assert record.read(tmp_path / "merged")["changes"] == changes
+
+
 #: Events of Python's audit hook that write.
 WRITING_EVENTS = ("open", "os.rename", "os.mkdir", "os.rmdir", "os.remove", "sqlite3.connect", "shutil.copyfile")
 

@@ -156,7 +156,8 @@ def test_columns_have_the_narrowest_type(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.partial"))
     # the order of columns follows the case numbers, not the order of storage
     row_columns = ["number", "integer", "mixed", "large", "only_case_0", "only_case_1", "metric"]
-    names = ["case", "outcome", "answered", *row_columns, "wall_time_s", "cpu_time_s", "error", "traceback"]
+    engine_columns = ["case_attempts", "wall_time_s", "cpu_time_s", "error", "traceback"]
+    names = ["case", "outcome", "answered", *row_columns, *engine_columns]
     assert pq.read_schema(path).names == names
     assert str(read_rows(path, 1)) == str([second])
 

@@ -99,6 +99,15 @@ def test_terrain_follows_the_number_of_the_streams(tmp_path: Path) -> None:
     assert blended.blend == ((5, 0.8), (17, 0.6))
 
 
+def test_number_in_turn_that_selects_no_terrain_is_rejected(tmp_path: Path) -> None:
+    dispersions = (
+        DISPERSIONS.replace("HIGH", "99_999") + 'bank_seed = {distribution = "in-turn", low = 0, high = 99999}'
+    )
+    campaign = load_campaign(str(write_campaign(tmp_path, dispersions=dispersions)))
+    with pytest.raises(CampaignError, match=r"dispersions\.bank_seed: is a distribution 'in-turn' of a number that"):
+        prepare_campaign(campaign, 100)
+
+
 def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:
     campaign = load_fake_campaign(tmp_path, 99_999, bound=0.5)
     parameters = SearchParameters("velocity", cases=20, restarts=1, max_failures=1)
