@@ -65,4 +65,5 @@ def _simulate_case(campaign: Campaign, case: int) -> Mapping[str, Scalar]:
     detector = draw_detector(p, camera_optics(p.camera), streams)
     instruments = DescentInstruments.draw(p, world, flight, streams)
     images = [np.zeros((1, 1), dtype=np.uint16)] * len(states)
-    return instrument_errors(world, states, measure(p, world, flight.motion, images, detector, instruments, streams))
+    measurements = measure(p, world, flight.motion, images, detector, instruments, streams)
+    return instrument_errors(p, world, states, measurements)

@@ -73,6 +73,8 @@ TrackErrors = Float[np.ndarray, "descents 2 2 2"]
 
 #: Image and calibration of `BinnedView`, which the geometric simulation does not use.
 _EMPTY_IMAGE = np.zeros((256, 256), dtype=np.float32)
+#: Sun below the horizon, so that no template is masked.
+_NO_SUN = np.array([0.0, 0.0, -1.0])
 _CALIBRATION = DetectorCalibration(_EMPTY_IMAGE, 1.0, 0.0, 0.0, 1, 0.0, 1)
 
 
@@ -105,11 +107,10 @@ def _draw_descent_errors(
     true_views, measured_views = _draw_views(inputs, camera, rng)
     # the square root makes the density uniform over the disc
     velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _draw_direction(rng)
-    no_sun = np.array([0.0, 0.0, -1.0])  # below the horizon, so that no template is masked
     errors = np.empty((2, 2, 2))
     for pair in range(2):
         first, second = measured_views[pair], measured_views[pair + 1]
-        candidates = template_candidates(first, second, search_geometry(first, second, options), no_sun, options)
+        candidates = template_candidates(first, second, search_geometry(first, second, options), options)
         scores = rng.uniform(size=len(candidates.pixels))
         indices = best_candidates(scores, candidates.pixels, candidates.preference, 2, options.exclusion_px)
         if len(indices) < 2:
@@ -174,9 +175,8 @@ def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotatio
 def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> BinnedView:
     """Create a view without an image, from a camera in the body frame."""
     centre = np.array([0.0, 0.0, altitude_m])
-    return BinnedView(
-        _EMPTY_IMAGE, _EMPTY_IMAGE, camera.transform(rigid(attitude, centre)), centre, time_s, _CALIBRATION, 1
-    )
+    placed = camera.transform(rigid(attitude, centre))
+    return BinnedView(_EMPTY_IMAGE, _EMPTY_IMAGE, placed, centre, _NO_SUN, time_s, _CALIBRATION, 1)
 
 
 def _draw_direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:

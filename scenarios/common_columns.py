@@ -70,7 +70,10 @@ VELOCITY = (
     error("velocity_error_x_m_s", "eastward error of the velocity", "east velocity error"),
     error("velocity_error_y_m_s", "northward error of the velocity", "north velocity error"),
     outcome("velocity_estimated_*_m_s", "component of the reported velocity, x east and y north"),
-    outcome("velocity_true_*_m_s", "component of the true velocity of the same interval, x east and y north"),
+    outcome(
+        "velocity_true_*_m_s",
+        "component of the true velocity of the same interval, x east and y north; in the field test from GPS positions",
+    ),
     outcome("velocity_sd_*_m_s", "reported standard deviation of a component of the velocity"),
     outcome("velocity_correlation", "reported correlation of the errors of both components"),
     error("velocity_normalised_*", "error of a component divided by its reported standard deviation"),

@@ -144,6 +144,8 @@ class DescentMeasurements:
       (the paper's "biased IMU horizontal velocities")
     - sun_direction: unit vector to the sun, world axes
     - inertial_velocities_m_s: inertial velocities at the images, with the same error; None if not recorded
+    - sun_directions: unit vectors to the sun at the images, if the sun moves between them (the field test's triples);
+      None: `sun_direction` at all images
     - increments: inertial increments of a unit of the vision system, from before the first image to after the last
       image; None without this unit. Its errors are independent of those of the inertial velocities.
     - gravity_m_s2: gravity of the site, along world -z; None without increments
@@ -157,6 +159,7 @@ class DescentMeasurements:
     inertial_velocities_m_s: Float[np.ndarray, "images 3"] | None = None
     increments: ImuIncrements | None = None
     gravity_m_s2: float | None = None
+    sun_directions: Float[np.ndarray, "images 3"] | None = None
     #: Arguments of the method `start` of an algorithm that receives the measurements one by one.
     start_inputs: ClassVar[tuple[()]] = ()
 
@@ -170,15 +173,21 @@ class DescentMeasurements:
         """Time tags of the last two images."""
         return self.images[-2].time_s, self.images[-1].time_s
 
+    def suns(self) -> Float[np.ndarray, "images 3"]:
+        """Return the unit vectors to the sun at the images, world axes."""
+        if self.sun_directions is not None:
+            return self.sun_directions
+        return np.tile(self.sun_direction, (len(self.images), 1))
+
     def frames(self) -> tuple[DescentFrame, ...]:
         """Return the measurements of each image."""
-        velocities = self.inertial_velocities_m_s
+        velocities, suns = self.inertial_velocities_m_s, self.suns()
         return tuple(
             DescentFrame(
                 image=image,
                 attitude=self.attitudes[number],
                 altitude=self.altitudes[number],
-                sun_direction=self.sun_direction,
+                sun_direction=suns[number],
                 inertial_velocity_m_s=None if velocities is None else velocities[number],
                 interval_velocity_m_s=self.interval_velocities_m_s[number - 1] if number else None,
                 gravity_m_s2=self.gravity_m_s2,
@@ -217,6 +226,7 @@ class DescentMeasurements:
             altitudes=tuple(self.altitudes[index] for index in indices),
             interval_velocities_m_s=np.array(mean_velocities, dtype=np.float64).reshape(-1, 3),
             inertial_velocities_m_s=None if velocities is None else velocities[list(indices)],
+            sun_directions=None if self.sun_directions is None else self.sun_directions[list(indices)],
         )
 
     def _mean_velocity(self, first: int, second: int) -> Float[np.ndarray, "3"]:

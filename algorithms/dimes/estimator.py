@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.arrays import Vector2, Vector3
+from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.dimes import overlap, tilt
 from marsyard.algorithms.dimes.ground_view import pixels_from_ground, zero_phase_pixel
 from marsyard.algorithms.dimes.options import DimesOptions
@@ -50,12 +50,10 @@ def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Ve
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
 
 
-def track_pair(
-    pair: int, first: BinnedView, second: BinnedView, sun_direction: Vector3, options: DimesOptions
-) -> PairDetails:
+def track_pair(pair: int, first: BinnedView, second: BinnedView, options: DimesOptions) -> PairDetails:
     """Select and track the templates of one pair of views."""
     geometry = overlap.search_geometry(first, second, options)
-    candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)
+    candidates = overlap.template_candidates(first, second, geometry, options)
     selection, contrasts = overlap.select_templates(first, candidates, options)
     tracks = []
     for index, (candidate, contrast) in enumerate(zip(selection, contrasts, strict=True)):
@@ -86,7 +84,7 @@ def track_pair(
         tracks.append(track)
     return PairDetails(
         overlap_polygon=overlap.overlap_polygon(first, second, options),
-        zero_phase_pixels=np.stack([zero_phase_pixel(view, sun_direction) for view in (first, second)]),
+        zero_phase_pixels=np.stack([zero_phase_pixel(view) for view in (first, second)]),
         gsd_m=geometry.gsd_m,
         tracks=tuple(tracks),
         views=(first, second),
@@ -117,10 +115,9 @@ class DimesEstimator:
         if views is None:
             return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
         first, second, third = views
-        sun = measurements.sun_direction
-        pairs = (track_pair(0, first, second, sun, self.options), track_pair(1, second, third, sun, self.options))
+        pairs = (track_pair(0, first, second, self.options), track_pair(1, second, third, self.options))
         answer = combine_pairs(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
-        return correct_tilt(answer, sun, self.options) if self.options.correct_tilt else answer
+        return correct_tilt(answer, self.options) if self.options.correct_tilt else answer
 
 
 def combine_pairs(
@@ -138,7 +135,7 @@ def combine_pairs(
     return VelocityEstimate(outcome, None, DimesDetails(pairs, candidates, None))
 
 
-def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: DimesOptions) -> VelocityEstimate:
+def correct_tilt(answer: VelocityEstimate, options: DimesOptions) -> VelocityEstimate:
     """Correct a valid answer for the common tilt of the attitudes, which the inclination of the ground shows.
 
     The published answer remains if there are too few tracks, or if the fit contradicts the errors of the instruments.
@@ -150,8 +147,7 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
     selected = (details.selected.first, details.selected.second)
     velocities = [pair.tracks[index].velocity_m_s for pair, index in zip(details.pairs, selected, strict=True)]
     grids = [
-        track_grid(*pair.views, velocity, sun_direction, options)
-        for pair, velocity in zip(details.pairs, velocities, strict=True)
+        track_grid(*pair.views, velocity, options) for pair, velocity in zip(details.pairs, velocities, strict=True)
     ]
     if min(len(grid.first) for grid in grids) < tilt.MIN_TRACKS:
         return answer

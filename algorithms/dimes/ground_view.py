@@ -66,18 +66,18 @@ def anti_solar_direction(sun_direction: Vector3) -> Vector3:
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
-def zero_phase_pixel(view: BinnedView, sun_direction: Vector3) -> Vector2:
+def zero_phase_pixel(view: BinnedView) -> Vector2:
     """Pixel (u, v) of the centre of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     # a point at 10 000 km represents infinity
-    pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
+    pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(view.sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
 
 def outside_zero_phase(
-    view: BinnedView, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
+    view: BinnedView, ground: Float[np.ndarray, "*shape 2"], radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points (east, north) are farther than `radius_rad` from the anti-solar direction."""
-    spot = anti_solar_direction(sun_direction)
+    spot = anti_solar_direction(view.sun_direction)
     east, north, height = ground[..., 0], ground[..., 1], view.centre[2]
     ranges = np.sqrt(east**2 + north**2 + height**2)
     dot_products = east * spot[0] + north * spot[1] - height * spot[2]

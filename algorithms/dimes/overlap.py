@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
+from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2
 from marsyard.algorithms.dimes import ground_view, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView
@@ -90,9 +90,7 @@ def grid_pixels(size: tuple[int, int], step: int) -> Points2:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def overlap_width_m(
-    first: BinnedView, second: BinnedView, gsd_m: float, sun_direction: Vector3, options: DimesOptions
-) -> float:
+def overlap_width_m(first: BinnedView, second: BinnedView, gsd_m: float, options: DimesOptions) -> float:
     """Compute the diameter of the largest circle of ground in both views at zero motion, outside the zero-phase spot.
 
     The result is 0 without common ground; its resolution is the ground sample distance `gsd_m`.
@@ -110,7 +108,7 @@ def overlap_width_m(
         # vertices in 1/16 of a cell
         vertices = np.rint(16.0 * (outline - low) / gsd_m).astype(np.int32)
         overlap &= cv2.fillPoly(np.zeros_like(overlap), [vertices], (1,), shift=4).astype(np.uint8)
-        overlap &= ground_view.outside_zero_phase(view, ground, sun_direction, options.zero_phase_radius_rad)
+        overlap &= ground_view.outside_zero_phase(view, ground, options.zero_phase_radius_rad)
     # cells outside the grid belong to the ground outside the overlap
     distances = cv2.distanceTransform(np.pad(overlap, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return 2.0 * gsd_m * float(distances.max())
@@ -132,7 +130,7 @@ class Candidates:
 
 
 def template_candidates(
-    first: BinnedView, second: BinnedView, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
+    first: BinnedView, second: BinnedView, geometry: SearchGeometry, options: DimesOptions
 ) -> Candidates:
     """Find all feasible template positions on the coarse grid.
 
@@ -142,7 +140,7 @@ def template_candidates(
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = ground_view.ground_from_pixels(first, pixels, limit)
-    is_wide = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options) >= geometry.max_displacement_m
+    is_wide = overlap_width_m(first, second, geometry.gsd_m, options) >= geometry.max_displacement_m
     feasible = visible & is_wide
     pixels, ground = pixels[feasible], ground[feasible]
     feasible = ground_view.inside_frame(second, ground, 0.0, limit)
@@ -152,10 +150,10 @@ def template_candidates(
     pixels, ground = pixels[feasible], ground[feasible]
     is_valid = np.ones(len(ground), dtype=bool)
     for view in (first, second):
-        is_valid &= _are_outside_spot(view, ground, template_half_m, _TEMPLATE_POINTS, sun_direction, options)
+        is_valid &= _are_outside_spot(view, ground, template_half_m, _TEMPLATE_POINTS, options)
     is_inside = _lie_in_view(second, ground, template_half_m, options)
     is_complete = _lie_in_view(second, ground, window_half_m, options)
-    is_outside = _are_outside_spot(second, ground, window_half_m, _WINDOW_POINTS, sun_direction, options)
+    is_outside = _are_outside_spot(second, ground, window_half_m, _WINDOW_POINTS, options)
     preference = np.sum([is_inside, is_complete, is_complete & is_outside], axis=0)
     return Candidates(pixels[is_valid], ground[is_valid], preference[is_valid])
 
@@ -168,12 +166,10 @@ def _lie_in_view(view: BinnedView, ground: Points2, half_m: float, options: Dime
     )
 
 
-def _are_outside_spot(
-    view: BinnedView, ground: Points2, half_m: float, per_side: int, sun_direction: Vector3, options: DimesOptions
-) -> Flags:
+def _are_outside_spot(view: BinnedView, ground: Points2, half_m: float, per_side: int, options: DimesOptions) -> Flags:
     """Whether squares around ground points are outside of the zero-phase spot, by lattices of `per_side` points."""
     points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
-    outside = ground_view.outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
+    outside = ground_view.outside_zero_phase(view, points, options.zero_phase_radius_rad)
     return np.asarray(outside.all(axis=1))
 
 

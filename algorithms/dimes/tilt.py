@@ -61,9 +61,7 @@ class GroundTracks:
     interval_s: float
 
 
-def track_grid(
-    first: BinnedView, second: BinnedView, velocity_m_s: Vector2, sun_direction: Vector3, options: DimesOptions
-) -> GroundTracks:
+def track_grid(first: BinnedView, second: BinnedView, velocity_m_s: Vector2, options: DimesOptions) -> GroundTracks:
     """Track a grid of templates on the common ground, from the positions that a velocity (east, north) predicts.
 
     Both views are rectified with the full camera model, the second one shifted by the predicted displacement. Templates
@@ -85,7 +83,7 @@ def track_grid(
     corners = side * np.stack(np.divmod(np.arange(per_side**2), per_side), axis=-1)
     rows, columns = ((corners + 0.5 * (side - size)) * gsd).T
     ground = centre + np.column_stack([columns, -rows])
-    usable = np.all([_is_usable(view, ground - offset, gsd, sun_direction, options) for view, offset in shifts], axis=0)
+    usable = np.all([_is_usable(view, ground - offset, gsd, options) for view, offset in shifts], axis=0)
     points, shifts_px = [], []
     for (row, column), point in zip(corners[usable], ground[usable], strict=True):
         template = templates[row : row + side, column : column + side]
@@ -103,12 +101,12 @@ def track_grid(
     )
 
 
-def _is_usable(view: BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions) -> Flags:
+def _is_usable(view: BinnedView, ground: Points2, gsd_m: float, options: DimesOptions) -> Flags:
     """Whether templates around ground points lie in a view and outside of its zero-phase spot."""
     half_m = (0.5 * options.grid_template_px + MARGIN_PX) * gsd_m
     squares = ground[:, None] + ground_view.square_outline(half_m, overlap.OUTLINE_POINTS)
     inside = ground_view.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
-    outside = ground_view.outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
+    outside = ground_view.outside_zero_phase(view, squares, options.zero_phase_radius_rad)
     return np.asarray((inside & outside).all(axis=1))
 
 

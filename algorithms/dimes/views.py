@@ -61,6 +61,7 @@ class BinnedView:
     - camera: Camera model of the binned image in the view's ground frame: axes east, north, up; the ground is the plane
       z = 0 at the measured altitude below the body's origin, and the origin is the camera's nadir point
     - centre: The camera's position in that frame, metres: (0, 0, height)
+    - sun_direction: Vector to the sun at the image, world axes
     - time_s: Time tag at mid-exposure
     - calibration: Calibration of the detector, for the corrections of `correct_patch`
     - rows_summed: Physical rows in one row of `signal`, binned on the chip and by software
@@ -70,6 +71,7 @@ class BinnedView:
     flat_field: Raster
     camera: CameraModel
     centre: Vector3
+    sun_direction: Vector3
     time_s: float
     calibration: DetectorCalibration
     rows_summed: int
@@ -94,6 +96,7 @@ def build_view(
     image: DetectorImage,
     world_from_body: Rotation,
     altitude_m: float,
+    sun_direction: Vector3,
     binned_size: tuple[int, int],
     previous: BinnedView | None = None,
 ) -> BinnedView:
@@ -107,6 +110,7 @@ def build_view(
         flat_field=bin_mean(detector.flat_field, columns, rows) if shared_flat_field is None else shared_flat_field,
         camera=camera,
         centre=centre,
+        sun_direction=sun_direction,
         time_s=image.time_s,
         calibration=detector,
         rows_summed=detector.rows_summed * rows,
@@ -142,8 +146,9 @@ def build_views(
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
         return None
     views: list[BinnedView] = []
-    for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
+    per_image = zip(measurements.images, measurements.attitudes, altitudes, measurements.suns(), strict=True)
+    for image, attitude, altitude, sun in per_image:
         previous = views[-1] if views else None
-        views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, previous))
+        views.append(build_view(image, attitude.world_from_body, float(altitude), sun, binned_size, previous))
     in_range = all(HEIGHT_RANGE_M[0] <= view.centre[2] <= HEIGHT_RANGE_M[1] for view in views)
     return (views[0], views[1], views[2]) if in_range else None

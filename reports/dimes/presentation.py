@@ -124,21 +124,35 @@ DIMES_CASE = CaseKind(figures.is_dimes_case, view)
 
 
 def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
-    """Compare a velocity error with the errors that attitude and altitude cause alone.
+    """Compare the error of the reported velocity with the errors that attitude and altitude cause alone.
 
     An attitude error a makes v tan(a) of the descent rate v appear as horizontal velocity; a relative altitude error
-    scales the horizontal velocity.
+    scales the horizontal velocity. Errors at the firing have no cause: the same attitude error changes the propagation.
     """
-    error_m_s = abs(to_float(row.get(metric)))
-    if "velocity_error" not in metric or math.isnan(error_m_s):
-        return None
     attitude_deg, rate_m_s = (to_float(row.get(name)) for name in ("attitude_error_common_deg", "descent_rate_m_s"))
     altitude, speed_m_s = (to_float(row.get(name)) for name in ("altitude_error_common", "horizontal_speed_m_s"))
     by_attitude_m_s = abs(rate_m_s * math.tan(math.radians(attitude_deg)))
+    attitude_text = f"the attitude error of {number(attitude_deg)} deg"
+    return find_cause(row, metric, (attitude_text, by_attitude_m_s), altitude, speed_m_s)
+
+
+def find_cause(
+    row: Mapping[str, Any], metric: str, attitude: tuple[str, float], altitude: float, speed_m_s: float
+) -> Cause | None:
+    """Return the cause of at least half of an error of the reported velocity, or the images.
+
+    Returns None for other metrics, and if a quantity is unknown.
+
+    - attitude: text of the attitude error, and the velocity error that it causes, m/s
+    - altitude, speed_m_s: relative altitude error, and the horizontal speed that it scales
+    """
+    error_m_s = abs(to_float(row.get(metric)))
+    attitude_text, by_attitude_m_s = attitude
     by_altitude_m_s = abs(altitude * speed_m_s)
+    if not metric.startswith("velocity_error") or math.isnan(error_m_s + by_attitude_m_s + by_altitude_m_s):
+        return None
     if by_attitude_m_s >= 0.5 * error_m_s:
-        text = f"the attitude error of {number(attitude_deg)} deg causes up to {number(by_attitude_m_s)} m/s"
-        return Cause("attitude error", text)
+        return Cause("attitude error", f"{attitude_text} causes up to {number(by_attitude_m_s)} m/s")
     if by_altitude_m_s >= 0.5 * error_m_s:
         text = f"the altitude error of {percent(abs(altitude))} causes up to {number(by_altitude_m_s)} m/s"
         return Cause("altitude error", text)

@@ -16,12 +16,12 @@ from matplotlib.patches import Circle
 
 from marsyard.reports import populations, rates
 from marsyard.reports.column_selection import axis_columns
-from marsyard.reports.column_values import numbers
-from marsyard.reports.dimes.presentation import explain
+from marsyard.reports.column_values import numbers, to_float
+from marsyard.reports.dimes.presentation import find_cause
 from marsyard.reports.figure_style import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.fits import fit_note
 from marsyard.reports.papers import read_paper
-from marsyard.reports.presentation import Presentation
+from marsyard.reports.presentation import Cause, Presentation
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Section, Subject, SvgFigure, build_grid, svg_figure
 from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
@@ -181,6 +181,18 @@ def _draw_scatter(rows: pd.DataFrame, components: Sequence[str], subject: Subjec
     axes.set(xlabel=label(components[0]), ylabel=label(components[1]))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, handletextpad=0.2)
     return figure
+
+
+def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
+    """Compare a velocity error with the errors that the attitudes and altitudes of the last pair cause alone."""
+    by_attitude_m_s = to_float(row.get("attitude_velocity_error_m_s"))
+    errors_m, altitudes_m = (
+        np.array([to_float(row.get(f"{name}_{image}_m")) for image in (2, 3)])
+        for name in ("altitude_error", "altitude")
+    )
+    speed_m_s = math.hypot(*(to_float(row.get(f"velocity_true_{axis}_m_s")) for axis in "xy"))
+    attitude = ("the change of the attitude error between the images", by_attitude_m_s)
+    return find_cause(row, metric, attitude, float(np.mean(errors_m / altitudes_m)), speed_m_s)
 
 
 FIELD_TEST = Presentation(first=(field_test_section,), explain=explain)

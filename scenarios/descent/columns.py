@@ -29,19 +29,19 @@ COLUMNS = Columns(
         ),
         condition(
             "overlap_width_first_pair_m",
-            "diameter of the largest circle of level ground in both images of the first pair",
+            "diameter of the largest circle of level ground in both images of the first pair, taken above one point",
             label="width of the ground in both images of the first pair",
         ),
         condition(
             "overlap_width_second_pair_m",
-            "diameter of the largest circle of level ground in both images of the second pair",
+            "diameter of the largest circle of level ground in both images of the second pair, taken above one point",
             label="width of the ground in both images of the second pair",
         ),
         Column(
             "feasible_overlap",
             ColumnKind.TRUTH,
-            "in both image pairs, the ground that both images show outside of the bright spot opposite the sun is at "
-            "least 110 m across",
+            "in both image pairs, the ground that both images show without horizontal motion, outside of the bright "
+            "spot opposite the sun, is at least 110 m across",
             population="with feasible overlap",
             type=bool,
             enables_answer=True,

@@ -45,14 +45,14 @@ def conditions(
 
 
 def instrument_errors(
-    world: DescentWorld, states: Sequence[State], measurements: DescentMeasurements
+    p: DescentScenarioParameters, world: DescentWorld, states: Sequence[State], measurements: DescentMeasurements
 ) -> dict[str, Scalar]:
     """Compute the columns of measurement errors, split into a part common to all images and an independent part.
 
     The common attitude error is the mean of the images' rotation vectors (world axes); the independent part is the
     RMS length of the residuals. Relative altitude errors are split likewise. True altitudes are heights above the
     ground directly below; a radar return from nearer relief is therefore an error. The velocity change is that between
-    the last two intervals.
+    the image pairs of the triple.
     """
     rotations = np.stack(
         [
@@ -65,10 +65,6 @@ def instrument_errors(
     tag_errors = np.array([image.time_s for image in measurements.images]) - np.array(
         [state.time_s for state in states]
     )
-    true_changes, changes = (
-        np.diff(velocities[:, :2], axis=0)
-        for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
-    )
     residuals = rotations - rotations.mean(axis=0)
     row: dict[str, Scalar] = {
         "attitude_error_common_deg": float(np.degrees(np.linalg.norm(rotations.mean(axis=0)))),
@@ -76,8 +72,10 @@ def instrument_errors(
         "altitude_error_common": float(relative_errors.mean()),
         "altitude_error_independent": float(np.sqrt(np.mean((relative_errors - relative_errors.mean()) ** 2))),
     }
-    if len(changes):
-        row["velocity_change_error_m_s"] = float(np.hypot(*(changes[-1] - true_changes[-1])))
+    if p.triple_indices is not None:
+        true_m_s = mean_velocities([states[index] for index in p.triple_indices])
+        errors_m_s = (measurements.select(p.triple_indices).interval_velocities_m_s - true_m_s)[:, :2]
+        row["velocity_change_error_m_s"] = float(np.hypot(*(errors_m_s[1] - errors_m_s[0])))
     for number, (rotation, error, tag_error) in enumerate(
         zip(rotations, relative_errors, tag_errors, strict=True), start=1
     ):

@@ -1,6 +1,9 @@
 """Faults of a descent, and their injection into terrain, clouds, times and measurements."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -57,7 +60,9 @@ class DescentFaults(SizedFaults):
     altitude_error_once: Annotated[
         NonNegative, Field(le=0.9, description="additional relative error of the altitude of image 2")
     ] = 0.0
-    attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
+    attitude_error_deg: Annotated[
+        NonNegative, Field(le=90.0, description="tilt error of the navigation's attitude, and of its velocity changes")
+    ] = 0.0
     attitude_error_once_deg: Annotated[
         NonNegative, Field(le=90.0, description="additional tilt error of the attitude of image 2")
     ] = 0.0
@@ -112,17 +117,32 @@ def add_altitude_faults(faults: DescentFaults, altitudes: Sequence[AltitudeMeasu
     ]
 
 
-def add_attitude_faults(
-    faults: DescentFaults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
-) -> list[AttitudeMeasurement]:
-    """Tilt all attitudes about one random horizontal axis, and that of `FAULTY_IMAGE` also about a second one."""
-    axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
-    common_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
-    single_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
-    return [
-        AttitudeMeasurement(
-            (single_tilt if index == FAULTY_IMAGE else Rotation.identity()) * common_tilt * attitude.world_from_body,
-            attitude.time_s,
+@dataclass(frozen=True)
+class AttitudeTilts:
+    """Tilts of the attitude faults, rotations in world axes about random horizontal axes.
+
+    - common: tilt of the navigation's attitude from the start of the descent, and of a custom attitude source
+    - single: additional tilt of the measured attitude of `FAULTY_IMAGE`
+    """
+
+    common: Rotation
+    single: Rotation
+
+    @classmethod
+    def draw(cls, faults: DescentFaults, rng: np.random.Generator) -> AttitudeTilts:
+        """Draw the axes of both tilts; a fault of size 0 is the identity."""
+        axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
+        sizes_deg = (faults.attitude_error_deg, faults.attitude_error_once_deg)
+        common, single = (
+            Rotation.from_rotvec(np.radians(size) * axis) for size, axis in zip(sizes_deg, axes, strict=True)
         )
-        for index, attitude in enumerate(attitudes)
-    ]
+        return cls(common, single)
+
+    def tilt_faulty_image(self, attitudes: Sequence[AttitudeMeasurement]) -> list[AttitudeMeasurement]:
+        """Tilt the measured attitude of `FAULTY_IMAGE` by the single tilt."""
+        return [
+            replace(attitude, world_from_body=self.single * attitude.world_from_body)
+            if index == FAULTY_IMAGE
+            else attitude
+            for index, attitude in enumerate(attitudes)
+        ]

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import Images
-from marsyard.scenarios.descent.faults import add_altitude_faults, add_attitude_faults
+from marsyard.scenarios.descent.faults import AttitudeTilts, add_altitude_faults
 from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
@@ -45,10 +45,12 @@ class DescentInstruments:
 
     - approach: flight before the descent, during which navigation errors grow
     - imu: inertial unit of the navigation, with the errors that remain after its calibration
-    - navigation: propagated attitude and velocity, from shortly before the first image to the thrusters' firing
+    - navigation: propagated attitude and velocity, from shortly before the first image to the thrusters' firing; exact
+      with `exact_instruments`
     - altimeter: the radar, or the readings of a custom altimeter
     - tags_s: time tags of the images
     - attitude_source: readings of a custom attitude source at the time tags; None: attitudes of the navigation are used
+    - tilts: tilts of the attitude faults
     - row: columns of the custom instruments
     """
 
@@ -58,6 +60,7 @@ class DescentInstruments:
     altimeter: RadarAltimeter | InstrumentReadings
     tags_s: Float64[np.ndarray, "images"]
     attitude_source: InstrumentReadings | None
+    tilts: AttitudeTilts
     row: Mapping[str, Scalar]
 
     @classmethod
@@ -94,18 +97,24 @@ class DescentInstruments:
         else:
             altimeter = RadarAltimeter.draw(p.altimeter, surface, streams.generator("altimeter"))
         attitude_source = None if p.attitude_source is None else read(p.attitude_source, "attitude_source", tags)
-        # inertial navigation from the last star reference, before entry, to the thrusters' firing
-        errors = approach.errors(imu, streams.generator("approach"))
-        increments = imu.increments(motion, approach.end_s, end, streams.generator("inertial noise"))
+        tilts = AttitudeTilts.draw(p.faults, streams.generator("attitude fault"))
         state = motion.state(approach.end_s)
-        attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
+        if p.exact_instruments:
+            increments = imu.exact_increments(motion, approach.end_s, end)
+            attitude, velocity = state.attitude, state.velocity_m_s
+        else:
+            # inertial navigation from the last star reference, before entry, to the thrusters' firing
+            increments = imu.increments(motion, approach.end_s, end, streams.generator("inertial noise"))
+            errors = approach.errors(imu, streams.generator("approach"))
+            attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
         return cls(
             approach=approach,
             imu=imu,
-            navigation=InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p)),
+            navigation=InertialSolution.propagate(increments, tilts.common * attitude, velocity, gravity_m_s2(p)),
             altimeter=altimeter,
             tags_s=tags,
             attitude_source=attitude_source,
+            tilts=tilts,
             row=row,
         )
 
@@ -164,10 +173,11 @@ def measure(
         DetectorImage(counts, float(tag), camera, detector.calibration)
         for counts, tag in zip(images, tags, strict=True)
     ]
-    source = instruments.attitude_source
-    rotations = instruments.navigation.attitude(tags) if source is None else Rotation.from_quat(source.values)
+    source, tilts = instruments.attitude_source, instruments.tilts
+    rotations = (
+        instruments.navigation.attitude(tags) if source is None else tilts.common * Rotation.from_quat(source.values)
+    )
     attitudes = [AttitudeMeasurement(rotation, float(tag)) for rotation, tag in zip(rotations, tags, strict=True)]
-    attitudes = add_attitude_faults(p.faults, attitudes, streams.generator("attitude fault"))
     readings: Readings | InstrumentReadings
     if isinstance(instruments.altimeter, RadarAltimeter):
         times = instruments.altimeter.sampling.latest(np.array(p.image_times_s))
@@ -180,7 +190,7 @@ def measure(
     ]
     return DescentMeasurements(
         images=tuple(detector_images),
-        attitudes=tuple(attitudes),
+        attitudes=tuple(tilts.tilt_faulty_image(attitudes)),
         altitudes=tuple(add_altitude_faults(p.faults, altitudes)),
         interval_velocities_m_s=instruments.navigation.mean_velocities(tags),
         sun_direction=world.sun.direction,

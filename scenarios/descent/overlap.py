@@ -1,7 +1,8 @@
 """Overlap of a descent's image pairs: the ground that both images show, outside of the bright spot opposite the sun.
 
-The overlap (DIMES paper, section II.A) follows from true positions, attitudes and camera alone, so that it is the same
-for every algorithm. Polygons are outlines (east, north) on level ground.
+The overlap follows from true heights, attitudes and camera alone, so that it is the same for every algorithm. As in the
+DIMES paper (section II.A), the lander has no horizontal motion between the images; the minimum width leaves room for
+it. Polygons are outlines (east, north) on level ground, relative to the nadir point.
 """
 
 from collections.abc import Sequence
@@ -64,6 +65,8 @@ def overlap_width_m(
 ) -> float:
     """Compute the diameter of the largest circle of level ground that all images show outside of the bright spot.
 
+    The horizontal positions of the states are ignored: all images are taken above one point (section II.A).
+
     The result is 0 without common ground; its resolution is the spacing of the grid, 5 m.
     """
     footprints = [footprint(state, camera, ground_m) for state in states]
@@ -82,7 +85,7 @@ def overlap_width_m(
 
 
 def footprint(state: State, camera: CameraModel, ground_m: float) -> Polygon:
-    """Compute the outline (east, north) of the level ground that an image shows, world axes."""
+    """Compute the outline (east, north) of the level ground that an image shows, from its nadir point, world axes."""
     steps, zeros, ones = np.arange(_PER_SIDE) / _PER_SIDE, np.zeros(_PER_SIDE), np.ones(_PER_SIDE)
     fractions = np.column_stack(
         [np.concatenate([steps, ones, 1.0 - steps, zeros]), np.concatenate([zeros, steps, ones, 1.0 - steps])]
@@ -110,7 +113,7 @@ def _intersect_ground(state: State, directions: Float64[np.ndarray, "n 3"], grou
     off_nadir = np.minimum(np.arctan2(horizontal, -directions[:, 2]), MAX_OFF_NADIR_RAD)
     distances = (state.position_m[2] - ground_m) * np.tan(off_nadir)
     azimuths = directions[:, :2] / np.maximum(horizontal, 1e-12)[:, None]
-    return np.asarray(state.position_m[:2] + distances[:, None] * azimuths)
+    return np.asarray(distances[:, None] * azimuths)
 
 
 def _fill(polygon: Polygon, low: Float64[np.ndarray, "2"], shape: tuple[int, ...]) -> np.ndarray:

@@ -176,7 +176,8 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     exact_instruments: Annotated[
         bool,
         Field(
-            description="estimators receive true attitudes, altitudes, times, camera; shows the error from the images"
+            description="true attitudes, altitudes, times, camera, and propagation to the firing without errors; shows "
+            "the error from the images"
         ),
     ] = False
     landing: TouchdownParameters = TouchdownParameters()

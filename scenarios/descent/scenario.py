@@ -85,7 +85,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
             **overlap_row(p, descent.world, descent.states),
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
             **contrast_columns(descent.images[0], p.detector),
-            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **instrument_errors(p, descent.world, descent.states, descent.measurements),
             **descent.flight.row,
             **image_columns(p.render.backend, hash_images(descent.images)),
         }

@@ -22,6 +22,11 @@ COLUMNS = Columns(
         condition("location_north_m", "north position at the second image", "north position on the terrain"),
         condition("interval_*_s", "true time between the images of a pair"),
         instrument_error("attitude_change_*_deg", "change of the attitude error between the images of a pair"),
+        instrument_error(
+            "attitude_velocity_error_m_s",
+            "velocity error at the nadir that the attitude errors of the last pair cause",
+            label="velocity error by attitudes",
+        ),
         condition("cloud_transmittance_*", "mean fraction of direct sunlight that clouds transmit at an image"),
         condition("cloud_change_*", "mean change of the transmitted fraction between the images of a pair"),
         Column("image_time_*_s", ColumnKind.PROVENANCE, "true time of an image from the start of the run"),

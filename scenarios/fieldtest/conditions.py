@@ -39,7 +39,7 @@ def triple_columns(
         "location_east_m": float(second.position_m[0]),
         "location_north_m": float(second.position_m[1]),
         **condition_columns.sun_columns(measurements.sun_direction),
-        "horizontal_speed_m_s": float(np.hypot(*second.velocity_m_s[:2])),
+        "horizontal_speed_m_s": float(np.hypot(*case.states[-1].velocity_m_s[:2])),
     }
     errors = []
     samples = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
@@ -55,6 +55,12 @@ def triple_columns(
     for pair in (1, 2):
         row[f"attitude_change_{pair}_deg"] = float(np.degrees(np.linalg.norm(errors[pair] - errors[pair - 1])))
         row[f"interval_{pair}_s"] = abs(case.states[pair].time_s - case.states[pair - 1].time_s)
+    # a rotation vector e moves the nadir point at height h by h (-e_y, e_x)
+    second_shift, third_shift = (
+        height * error[:2] for height, error in zip(true_altitudes[1:], errors[1:], strict=True)
+    )
+    shift_m = float(np.linalg.norm(third_shift - second_shift))
+    row["attitude_velocity_error_m_s"] = shift_m / p.triples.virtual_interval_s
     row["off_nadir_max_deg"] = max(condition_columns.off_nadir_deg(state) for state in case.states)
     row["attitude_rate_max_deg_s"] = max(condition_columns.attitude_rate_deg_s(state) for state in case.states)
     return row

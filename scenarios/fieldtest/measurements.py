@@ -42,7 +42,7 @@ def measure(
     camera: CameraModel,
     rng: np.random.Generator,
 ) -> DescentMeasurements:
-    """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D).
+    """Create an estimator's inputs: time tags at the virtual interval, calibrated camera, sun of each image (III.D).
 
     The inertial velocities are the paper's truth velocities plus a constant horizontal error, drawn from `rng`: "biased
     IMU velocities" (III.D.3), because an inertial unit measures changes of velocity, but does not know the wind.
@@ -52,6 +52,7 @@ def measure(
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
     indices_and_tags = list(zip(case.triple.image_indices, tags, strict=True))
     altitudes = case.run.images.altitude_m
+    suns = np.stack([case.run.flown.sun(state.time_s) for state in case.states])
     return DescentMeasurements(
         images=tuple(
             DetectorImage(counts, tag, camera, detector.calibration) for counts, tag in zip(images, tags, strict=True)
@@ -59,5 +60,6 @@ def measure(
         attitudes=tuple(AttitudeMeasurement(case.run.attitudes[index], tag) for index, tag in indices_and_tags),
         altitudes=tuple(AltitudeMeasurement(float(altitudes[index]), tag) for index, tag in indices_and_tags),
         interval_velocities_m_s=truth_velocities(p, case) + bias,
-        sun_direction=case.run.flown.sun(case.states[1].time_s),
+        sun_direction=suns[1],
+        sun_directions=suns,
     )

@@ -137,9 +137,10 @@ def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"
 
 
 class RadarParameters(RangingParameters):
-    """Parameters of a radar altimeter. Defaults: the MER descent, with an error of 1 % of altitude (three sigma).
+    """Parameters of a radar altimeter. Defaults: the MER descent, with an error of 1 % of altitude.
 
-    Assumed: the split of the 1 % into a constant error and noise, beam, rate, rounding and time tags.
+    The 1 % is that expected of the flight's altimeter (DIMES field test paper, III.D.1). Assumed: 1 % is three standard
+    deviations, its split into a constant error and noise, beam, rate, rounding and time tags.
     """
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0

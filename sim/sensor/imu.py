@@ -35,14 +35,18 @@ Boundaries = Float64[np.ndarray, "m"]
 
 
 class WarmUp(Parameters):
-    """Temperature of the unit minus that of its calibration: zero until `start_s`, then approaches `change_k`."""
+    """Temperature of the unit minus that of its calibration: zero until `start_s`, then approaches `change_k`.
 
-    start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
+    Times are those from the start of the unit's use, at which its calibration ends: for a descent from the star
+    reference.
+    """
+
+    start_s: Annotated[float, Field(description="time from the start of use at which the change begins, s")] = 0.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="temperature change of the IMU, K")] = 0.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
 
     def temperature_k(self, times_s: Times) -> Times:
-        """Compute the temperature minus the calibration temperature, K."""
+        """Compute the temperature minus the calibration temperature, K, at times from the start of use."""
         return np.asarray(-self.change_k * np.expm1(-np.maximum(times_s - self.start_s, 0.0) / self.time_constant_s))
 
 
@@ -129,7 +133,7 @@ class Triad:
 
     - bias, bias_per_k: constant bias, unit/s, and its change with temperature, unit/s/K
     - wander: time-correlated bias, unit/s
-    - warm_up: temperature over time
+    - warm_up, start_s: temperature over time, and start of use
     - scale: relative errors of the scale factors
     - misalignment: cross-axis sensitivity of each sensor (row) to the axes (columns), radians; zero diagonal
     - random_walk: random walk coefficient, unit/sqrt(s)
@@ -140,6 +144,7 @@ class Triad:
     bias_per_k: Vector
     wander: GaussMarkov
     warm_up: WarmUp
+    start_s: float
     scale: Vector
     misalignment: Float64[np.ndarray, "3 3"]
     random_walk: float
@@ -152,7 +157,7 @@ class Triad:
 
     def bias_at(self, times_s: Times) -> Vectors:
         """Compute the total bias: constant, thermal and time-correlated; unit/s."""
-        thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
+        thermal = self.warm_up.temperature_k(times_s - self.start_s)[:, None] * self.bias_per_k
         return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
     def measure(self, increments: Vectors, boundaries_s: Boundaries, rng: np.random.Generator) -> Vectors:
@@ -178,7 +183,7 @@ class Imu:
 
     @classmethod
     def draw(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
-        """Draw the errors for use within a time span."""
+        """Draw the errors for use within a time span, whose start is that of the warm-up."""
         p = parameters
         # in each triad the errors are drawn in the order of its fields
         gyro = Triad(
@@ -186,6 +191,7 @@ class Imu:
             bias_per_k=p.gyro_bias_deg_h_k * DEG_H * rng.standard_normal(3),
             wander=GaussMarkov.draw(np.full(3, p.gyro_wander_deg_h * DEG_H), p.gyro_wander_s, span_s, rng),
             warm_up=p.warm_up,
+            start_s=span_s[0],
             scale=1e-6 * p.gyro_scale_ppm * rng.standard_normal(3),
             misalignment=1e-3 * p.gyro_misalignment_mrad * _draw_off_diagonal(rng),
             random_walk=p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
@@ -197,6 +203,7 @@ class Imu:
             bias_per_k=p.accelerometer_bias_mg_k * MILLI_G * rng.standard_normal(3),
             wander=GaussMarkov.draw(force_wander, p.accelerometer_wander_s, span_s, rng),
             warm_up=p.warm_up,
+            start_s=span_s[0],
             scale=1e-6 * p.accelerometer_scale_ppm * rng.standard_normal(3),
             misalignment=1e-3 * p.accelerometer_misalignment_mrad * _draw_off_diagonal(rng),
             random_walk=1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G,

@@ -41,7 +41,7 @@ def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[Vali
 def make_nadir_view() -> BinnedView:
     """Create a black view from 2 km."""
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), make_calibration())
-    return build_view(image, Rotation.identity(), 2000.0, (256, 256))
+    return build_view(image, Rotation.identity(), 2000.0, np.array([0.0, 0.0, 1.0]), (256, 256))
 
 
 def make_pair(*tracks: DimesTrack) -> PairDetails:

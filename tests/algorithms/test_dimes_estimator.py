@@ -258,6 +258,16 @@ def test_any_sun_gives_a_velocity_or_no_template_area(measurements: DescentMeasu
     assert answer.outcome in (VelocityOutcome.VALID, VelocityOutcome.NO_TEMPLATE_AREA)
 
 
+def test_zero_phase_spot_of_an_image_follows_from_its_sun(measurements: DescentMeasurements) -> None:
+    suns = np.stack([direction(np.radians(azimuth), np.radians(80.0)) for azimuth in (90.0, 120.0, 150.0)])
+    moving = get_details(ESTIMATOR.estimate(replace(measurements, sun_directions=suns)))
+    for pair, details in enumerate(moving.pairs):
+        for image in (0, 1):
+            fixed = get_details(ESTIMATOR.estimate(replace(measurements, sun_direction=suns[pair + image])))
+            expected = fixed.pairs[pair].zero_phase_pixels[image]
+            np.testing.assert_array_equal(details.zero_phase_pixels[image], expected)
+
+
 def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
     rng = np.random.default_rng(12)
     flight = draw_flight(rng, max_tilt_deg=10.0)

@@ -32,13 +32,16 @@ SUN_BELOW_HORIZON = direction(0.0, -1.0)
 
 
 def make_view(
-    attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
+    attitude: Rotation,
+    altitude_m: float,
+    time_s: float = 0.0,
+    counts: np.ndarray | None = None,
+    sun: np.ndarray = SUN_BELOW_HORIZON,
 ) -> BinnedView:
     """Create a view of level ground; its image is uniform unless `counts` are given."""
     image = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
-    return build_view(
-        DetectorImage(image, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration()), attitude, altitude_m, (256, 256)
-    )
+    detector_image = DetectorImage(image, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration())
+    return build_view(detector_image, attitude, altitude_m, sun, (256, 256))
 
 
 def make_views(
@@ -50,7 +53,8 @@ def make_views(
 
 def find_candidates(first: BinnedView, second: BinnedView, sun: np.ndarray = SUN_BELOW_HORIZON) -> overlap.Candidates:
     """Find the template candidates of a pair."""
-    return overlap.template_candidates(first, second, overlap.search_geometry(first, second, OPTIONS), sun, OPTIONS)
+    first, second = (replace(view, sun_direction=sun) for view in (first, second))
+    return overlap.template_candidates(first, second, overlap.search_geometry(first, second, OPTIONS), OPTIONS)
 
 
 def test_ground_and_pixel_projections_are_inverse() -> None:
@@ -81,7 +85,7 @@ def test_camera_is_above_origin_for_any_mounting_position() -> None:
     lever_arm_m = np.array([0.5, -1.0, -2.0])
     camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever_arm_m))
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, make_calibration())
-    view = build_view(image, attitude, 1400.0, (256, 256))
+    view = build_view(image, attitude, 1400.0, SUN_BELOW_HORIZON, (256, 256))
     np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)
     np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever_arm_m)[2]], atol=1e-9)
 
@@ -162,11 +166,11 @@ def test_overlap_width_is_that_of_the_strip_between_opposite_views() -> None:
     gsd_m = overlap.search_geometry(first, second, OPTIONS).gsd_m
     half_field = np.arctan(0.5 * 1024 * 12e-6 / 0.01467)
     expected = (2000.0 + 1719.0) * np.tan(half_field - np.radians(19.0))
-    width = overlap.overlap_width_m(first, second, gsd_m, SUN_BELOW_HORIZON, OPTIONS)
+    width = overlap.overlap_width_m(first, second, gsd_m, OPTIONS)
     # the grid changes the distance to each of both sides by up to a cell
     assert width == pytest.approx(expected, abs=2.0 * gsd_m + 0.05 * expected)
     apart = make_views(tilt_body(35.0, 0.0, 0.0), tilt_body(35.0, 180.0, 0.0))
-    assert overlap.overlap_width_m(*apart, gsd_m, SUN_BELOW_HORIZON, OPTIONS) == 0.0
+    assert overlap.overlap_width_m(*apart, gsd_m, OPTIONS) == 0.0
 
 
 def test_overlap_must_be_as_wide_as_the_largest_displacement() -> None:
@@ -179,7 +183,7 @@ def test_overlap_must_be_as_wide_as_the_largest_displacement() -> None:
     options = replace(OPTIONS, max_speed_m_s=80.0)
     geometry = overlap.search_geometry(*views, options)
     assert geometry.max_displacement_m == pytest.approx(300.0)
-    assert len(overlap.template_candidates(*views, geometry, SUN_BELOW_HORIZON, options).pixels) == 0
+    assert len(overlap.template_candidates(*views, geometry, options).pixels) == 0
 
 
 def test_searchable_positions_show_the_complete_template() -> None:
@@ -205,13 +209,11 @@ def test_searchable_positions_show_the_complete_template() -> None:
 def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     # The sun is in the east, 60 deg high: the shadow is in the west, at altitude / tan 60 from the nadir.
     sun = direction(np.radians(90.0), np.radians(60.0))
-    view = make_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
+    view = make_view(tilt_body(10.0, 200.0, 30.0), 2000.0, sun=sun)
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
     # A direction and a ground point along it project to the same pixel, except for rounding at distances of 1e7 m.
-    np.testing.assert_allclose(
-        zero_phase_pixel(view, sun), ground_view.pixels_from_ground(view, shadow)[0][0], atol=1e-3
-    )
-    assert np.all(np.isnan(zero_phase_pixel(view, -sun)))
+    np.testing.assert_allclose(zero_phase_pixel(view), ground_view.pixels_from_ground(view, shadow)[0][0], atol=1e-3)
+    assert np.all(np.isnan(zero_phase_pixel(replace(view, sun_direction=-sun))))
 
 
 def test_templates_and_windows_avoid_zero_phase_spot() -> None:

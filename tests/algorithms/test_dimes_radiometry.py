@@ -72,7 +72,7 @@ def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, 
     radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
     detector = make_calibration(transfer_row_s, clear_row_s)
     image = DetectorImage(expose_scene(radiance, detector, level=LEVEL), 0.0, CAMERA.bin(1, ROWS_SUMMED), detector)
-    return radiance, build_view(image, attitude, 1700.0, (256, 256))
+    return radiance, build_view(image, attitude, 1700.0, np.array([0.0, 0.0, 1.0]), (256, 256))
 
 
 @pytest.mark.parametrize("row_times_s", [(5e-6, 2e-6), (1e-6, 5e-6), (0.0, 0.0)])

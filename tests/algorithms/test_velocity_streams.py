@@ -219,7 +219,8 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
 
 @pytest.mark.parametrize("image_count", [1, 5])
 def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -> None:
-    measurements = inputs.inertial_descent(5).select(tuple(range(image_count)))
+    moving_sun = replace(inputs.inertial_descent(5), sun_directions=np.eye(5, 3))
+    measurements = moving_sun.select(tuple(range(image_count)))
     write_case(tmp_path, measurements)
     restored_case = read_case(tmp_path)
     assert isinstance(restored_case, DescentMeasurements)
@@ -229,10 +230,11 @@ def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -
     np.testing.assert_array_equal(restored_case.interval_velocities_m_s, measurements.interval_velocities_m_s)
     np.testing.assert_array_equal(restored_case.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
     assert hash_inputs(restored_case.increments) == hash_inputs(measurements.increments)
+    np.testing.assert_array_equal(restored_case.suns(), np.eye(image_count, 3))
     assert restored_case.gravity_m_s2 == measurements.gravity_m_s2
     # the files of descents without increments have no further keys
     write_case(tmp_path, inputs.descent())
-    assert not {"increments", "gravity_m_s2"} & set(json.loads((tmp_path / "case.json").read_text()))
+    assert not {"increments", "gravity_m_s2", "sun_directions"} & set(json.loads((tmp_path / "case.json").read_text()))
 
 
 def make_stream(spec: str) -> ExecutableAlgorithm:

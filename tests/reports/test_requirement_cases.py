@@ -17,6 +17,7 @@ from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.fieldtest.presentation import FIELD_TEST
 from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.images import thumbnail
@@ -34,6 +35,17 @@ ATTITUDE = {
     "altitude_error_common": 0.0,
     "descent_rate_m_s": 75.0,
     "horizontal_speed_m_s": 20.0,
+}
+#: A triple of the field test: the attitude error changes between its images.
+TRIPLE = {
+    "velocity_error_m_s": 5.2,
+    "attitude_velocity_error_m_s": 4.0,
+    "altitude_2_m": 1700.0,
+    "altitude_3_m": 1400.0,
+    "altitude_error_2_m": 6.0,
+    "altitude_error_3_m": 8.0,
+    "velocity_true_x_m_s": 20.0,
+    "velocity_true_y_m_s": 0.0,
 }
 #: Limits of the lander, and of an algorithm with a small threshold of roughness.
 LIMITS = {"lander.max_slope_deg": 15.0, "lander.max_roughness_m": 0.2, "max_slope_deg": 15.0, "max_roughness_m": 0.05}
@@ -226,13 +238,25 @@ def test_thumbnail_shows_the_last_image() -> None:
     [
         (DIMES, {**ATTITUDE, "attitude_error_common_deg": 4.0}, "velocity_error_m_s", "attitude error"),
         (DIMES, {**ATTITUDE, "altitude_error_common": 0.2}, "velocity_error_m_s", "altitude error"),
-        (DIMES, {"velocity_error_m_s": 5.2}, "velocity_error_m_s", "images"),
+        (DIMES, ATTITUDE, "velocity_error_m_s", "images"),
         (DIMES, {"velocity_error_m_s": math.nan}, "velocity_error_m_s", None),
         (DIMES, {}, "answered", None),
         (HDA, {**LIMITS, "site_slope_deg": 16.0, "site_roughness_m": 0.1}, "site_safe", "slope"),
         (HDA, {**LIMITS, **TOUCHDOWN}, "touchdown_safe", "roughness"),
         (HDA, {"site_slope_deg": math.nan}, "site_safe", None),
         (HDA, {"converged": False, "tracks": 3, "features": 80}, "converged", "few tracks"),
+        (DIMES, {**ATTITUDE, "descent_rate_m_s": np.nan}, "velocity_error_m_s", None),
+        # the propagation to the firing removes a part of an attitude error's effect
+        (DIMES, {**ATTITUDE, "firing_velocity_error_m_s": 0.2}, "firing_velocity_error_m_s", None),
+        (FIELD_TEST, TRIPLE, "velocity_error_m_s", "attitude error"),
+        (FIELD_TEST, {**TRIPLE, "attitude_velocity_error_m_s": 1.0}, "velocity_error_m_s", "images"),
+        (
+            FIELD_TEST,
+            {**TRIPLE, "attitude_velocity_error_m_s": 1.0, "altitude_error_2_m": 600.0},
+            "velocity_error_m_s",
+            "altitude error",
+        ),
+        (FIELD_TEST, {"velocity_error_m_s": 5.2}, "velocity_error_m_s", None),
         (HDA, {"converged": True}, "site_reported", None),
         (VTT, {"range_error_m": -0.04, "cross_error_m": 0.01, "drift_px": 1.0}, "position_error_m", "range"),
         (VTT, {"range_error_m": 0.01, "cross_error_m": -0.04, "drift_px": 1.0}, "position_error_m", "direction"),

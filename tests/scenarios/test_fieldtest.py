@@ -16,8 +16,10 @@ from marsyard.scenarios import fieldtest
 from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.fieldtest import run as run_module
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
+from marsyard.scenarios.fieldtest.conditions import triple_columns
 from marsyard.scenarios.fieldtest.flight import RunKey, field_camera
 from marsyard.scenarios.fieldtest.images import build_start_scene, run_ground, scene_at, sun_at, take_image
+from marsyard.scenarios.fieldtest.measurements import TripleCase, measure
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, ImageTargetParameters
 from marsyard.scenarios.fieldtest.run import FieldRun, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
@@ -341,6 +343,33 @@ def test_case_is_answered_and_deterministic() -> None:
     assert columns.items() <= repeated_result.row.items()
     with pytest.raises(ValueError, match="allowed: 0 to 138"):
         FieldTestScenario().run(parameters, Streams(5, "test", 139))
+
+
+def test_measurements_and_columns_are_those_of_each_image() -> None:
+    """The paper has a sun vector for each image (III.D); the images of a triple are minutes apart."""
+    parameters, run = make_parameters(), make_ivanpah_run()
+    key = run.flown.key
+    triple = next(item for item in run.triples if item.category is Category.OPPOSITE_DIRECTION)
+    states = [run.flown.flight.state(time) for time in run.truth.times_s[list(triple.image_indices)].tolist()]
+    case = TripleCase(run, triple, (states[0], states[1], states[2]))
+    images = [np.zeros((1, 1), dtype=np.uint16)] * 3
+    rng = np.random.default_rng(0)
+    measurements = measure(parameters, case, images, key.detector(), key.calibrated_camera(), rng)
+    for frame, state in zip(measurements.frames(), states, strict=True):
+        np.testing.assert_array_equal(frame.sun_direction, run.flown.sun(state.time_s))
+    suns = measurements.suns()
+    assert np.degrees(np.arccos(suns[0] @ suns[2])) > 0.5
+    row: Any = triple_columns(parameters, case, measurements, run_ground(key).surface)
+    assert row["horizontal_speed_m_s"] == np.hypot(*states[2].velocity_m_s[:2])
+    # the true nadir in body axes is rotated by the measured attitude, and intersected with level ground
+    shifts = []
+    for number, (attitude, state) in enumerate(zip(measurements.attitudes, states, strict=True), start=1):
+        down = (attitude.world_from_body * state.attitude.inv()).apply([0.0, 0.0, -1.0])
+        shifts.append(row[f"altitude_{number}_m"] * down[:2] / -down[2])
+    # images 2 and 3 are 3.75 s apart for the estimator; errors of second order in attitude errors of about a degree
+    expected_m_s = np.hypot(*(shifts[2] - shifts[1])) / 3.75
+    assert row["attitude_velocity_error_m_s"] == pytest.approx(expected_m_s, rel=0.05)
+    assert expected_m_s > 0.1
 
 
 def test_cloud_shadows_move_steadily_between_images() -> None:

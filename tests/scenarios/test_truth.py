@@ -132,7 +132,7 @@ def assert_flight_inputs_differ(
     """Assert that cameras, attitudes and altitudes differ from the truth."""
     # the increments are compared separately; the gravity of the site is known
     names = {"images", "attitudes", "altitudes", "interval_velocities_m_s", "sun_direction", "inertial_velocities_m_s"}
-    names |= {"increments", "gravity_m_s2"}
+    names |= {"increments", "gravity_m_s2", "sun_directions"}
     assert_all_fields_are_compared(DescentMeasurements, names)
     for image, attitude, altitude, state, altitude_m in zip(
         inputs.images, inputs.attitudes, inputs.altitudes, truth.states, altitudes_m, strict=True

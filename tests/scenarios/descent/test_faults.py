@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
-from marsyard.scenarios.descent.faults import DescentFaults, add_altitude_faults, add_attitude_faults
+from marsyard.scenarios.descent.faults import AttitudeTilts, DescentFaults, add_altitude_faults
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics, take_exposures
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
@@ -137,10 +137,11 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     shield_ranges = add_altitude_faults(DescentFaults(shield_range_m=60.0), readings)
     assert [entry.altitude_m for entry in shield_ranges] == [60.0, 80.0, 100.0]
     attitudes = [AttitudeMeasurement(Rotation.identity(), time_s) for time_s in (0.0, 1.0, 2.0)]
-    tilts = [entry.world_from_body for entry in add_attitude_faults(faults, attitudes, np.random.default_rng(0))]
-    assert np.degrees([tilts[0].magnitude(), tilts[2].magnitude()]) == pytest.approx([3.0, 3.0])
-    assert np.degrees((tilts[1] * tilts[0].inv()).magnitude()) == pytest.approx(5.0)
-    assert tilts[0].as_rotvec()[2] == 0.0
+    tilts = AttitudeTilts.draw(faults, np.random.default_rng(0))
+    assert np.degrees(tilts.common.magnitude()) == pytest.approx(3.0)
+    assert tilts.common.as_rotvec()[2] == tilts.single.as_rotvec()[2] == 0.0
+    tilted = [np.degrees(entry.world_from_body.magnitude()) for entry in tilts.tilt_faulty_image(attitudes)]
+    assert tilted == pytest.approx([0.0, 5.0, 0.0])
 
 
 def _render_descent(faults: Mapping[str, Any], **tables: Any) -> list[np.ndarray]:

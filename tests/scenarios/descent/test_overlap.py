@@ -50,13 +50,24 @@ def test_width_without_motion_is_that_of_the_footprint() -> None:
 
 
 @pytest.mark.parametrize("width_m", [300.0, 110.0, 0.0])
-def test_width_decreases_by_the_motion_between_the_images(width_m: float) -> None:
+def test_width_decreases_by_the_tilt_between_the_images(width_m: float) -> None:
+    """A tilt b moves the near edge of the second footprint to h tan(b - a), for a half field of view a."""
     camera = make_camera()
-    motion_m = 2.0 * half_widths_m(camera)[0] - width_m
-    width = overlap_width_m([make_state(0.0), make_state(motion_m)], camera, 0.0, LOW_SUN)
+    half_m = half_widths_m(camera)[0]
+    tilt_rad = np.arctan((half_m - width_m) / 1000.0) + np.arctan(half_m / 1000.0)
+    tilted = replace(make_state(0.0), attitude=Rotation.from_rotvec([0.0, -tilt_rad, 0.0]))
+    width = overlap_width_m([make_state(0.0), tilted], camera, 0.0, LOW_SUN)
     assert width == pytest.approx(width_m, abs=CELLS_M)
-    # no common ground
-    assert overlap_width_m([make_state(0.0), make_state(motion_m + width_m + 50.0)], camera, 0.0, LOW_SUN) == 0.0
+
+
+@pytest.mark.parametrize("motion_m", [100.0, 1000.0])
+def test_width_is_that_without_horizontal_motion(motion_m: float) -> None:
+    """The paper assumes no horizontal motion between the images, and requires 110 m for a motion of 30 m/s (II.A)."""
+    camera = make_camera()
+    still, moved = (
+        overlap_width_m([make_state(0.0), make_state(east_m)], camera, 0.0, LOW_SUN) for east_m in (0.0, motion_m)
+    )
+    assert moved == still > 0.0
 
 
 def test_bright_spot_is_excluded() -> None:

@@ -92,9 +92,10 @@ def test_rounding_errors_do_not_accumulate() -> None:
 
 
 def test_bias_follows_temperature() -> None:
+    """The temperature changes from the start of the use, as of a flight that is navigated for 1200 s before time 0."""
     warm_up = WarmUp(start_s=10.0, change_k=20.0, time_constant_s=100.0)
-    imu = Imu.draw(make_parameters(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
-    bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]))
+    imu = Imu.draw(make_parameters(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (-1200.0, 800.0), np.random.default_rng(0))
+    bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]) - 1200.0)
     np.testing.assert_array_equal(bias[:2], 0.0)
     np.testing.assert_allclose(bias[2], imu.gyro.bias_per_k * 20.0 * (1.0 - np.exp(-1.0)), rtol=1e-12)
     np.testing.assert_allclose(bias[3], imu.gyro.bias_per_k * 20.0, rtol=1e-8)
