@@ -93,6 +93,8 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context |= {"evidence": evaluation.evidence, "study_sentences": study_sentences(run.record)}
     context["cautions"] += evaluation.validity.sentences
+    if run.unverified:
+        context["cautions"].append(f"The rows are not verified, since {run.unverified}.")
     for row in context["verdicts"]:
         row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports import populations, rates
@@ -78,7 +79,7 @@ def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
 
 def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> AlgorithmResult:
     """Summarize the rows of one algorithm; `name` is its label in the result."""
-    magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
+    magnitude = _error_magnitudes(frame, metric) if metric is not None else np.full(len(frame), np.nan)
     finite = magnitude[np.isfinite(magnitude)]
     succeeded = None
     if metric is not None and bound is not None:
@@ -94,15 +95,21 @@ def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, boun
     )
 
 
+def _error_magnitudes(frame: pd.DataFrame, metric: str) -> Float[np.ndarray, " n"]:
+    """Return the magnitude of the error of each case; NaN for unfinished cases, whose errors no algorithm caused."""
+    return np.where(populations.engine_failed(frame), np.nan, np.abs(numbers(frame, metric)))
+
+
 def compare_with_tested(
     tested: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None
 ) -> PairedComparison:
     """Compare another algorithm, called `name`, with the tested one, from rows of the same cases in the same order."""
-    tested_error, other_error = (np.abs(numbers(frame, metric)) for frame in (tested, other))
+    tested_error, other_error = (_error_magnitudes(frame, metric) for frame in (tested, other))
     both_answered, groups = np.isfinite(tested_error) & np.isfinite(other_error), rates.terrain_groups(tested)
     success: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
-        success = compare_successes(tested_error <= bound, other_error <= bound, groups)
+        tested_success, other_success = (success_mask(frame, metric, bound) for frame in (tested, other))
+        success = compare_successes(tested_success, other_success, groups)
     answered_groups = None if groups is None else groups[both_answered]
     mean, lower, upper, p_value = compare_errors(
         (other_error - tested_error)[both_answered], answered_groups, CONFIDENCE

@@ -15,7 +15,13 @@ import pandas as pd
 from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
-from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
+from marsyard.reports.joint import (
+    JointEvidence,
+    describe_contribution,
+    find_record_changes,
+    qualify_verdict,
+    read_joint_evidence,
+)
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, OverallVerdict, combine_verdicts, compute_exit_code
 from marsyard.reports.populations import engine_failed
 from marsyard.reports.robustness import Robustness
@@ -63,7 +69,8 @@ class Evaluation:
     def exit_code(self) -> int:
         """The exit status of the verdicts, or of the study."""
         if not self.verdicts and self.overall_verdict.status is not None:
-            return {Status.PASS: 0, Status.FAIL: 1}.get(self.overall_verdict.status, 3)
+            codes = {Status.PASS: 0, Status.FAIL: 1, Status.UNVERIFIED: QUALIFIED_EXIT_CODE}
+            return codes.get(self.overall_verdict.status, 3)
         exit_code = compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
         return exit_code or (QUALIFIED_EXIT_CODE if self.is_qualified else 0)
 
@@ -93,29 +100,51 @@ def evaluate_run(
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.definition)
     if table(run.record.get("study")):
-        return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(run.record, run.all_cases))
+        overall = _evaluate_study(run.record, run.all_cases)
+        if run.unverified and overall.status is Status.PASS:
+            overall = replace(overall, status=Status.UNVERIFIED)
+        return Evaluation(run, sampling, read_evidence(run.record), (), overall)
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     joint = read_joint_evidence(evidence if record is None else replace(evidence, record=str(record)))
+    design = sampling.with_open_end if evidence.is_confirmation else sampling
+    if changes := find_record_changes(run, joint.own, design):
+        # FAIL in the record remains
+        evidence = replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes))
     evidence = replace(evidence, notes=(*evidence.notes, *joint.notes))
     columns = read_columns(str(run.definition.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the definition of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
-    design = sampling.with_open_end if evidence.is_confirmation else sampling
     earlier = [joint.earlier_evidence(requirement) for requirement in run.requirements]
     verdicts = evaluate_requirements(run.all_cases, run.requirements, design, from_truth, configured, earlier)
-    unfinished_reason = _describe_unfinished(run)
+    unfinished_reason = _describe_unfinished(run) or _describe_wrong_rows(run)
     if unfinished_reason:
         verdicts = [_withhold_unfinished(verdict, unfinished_reason) for verdict in verdicts]
         overall = combine_verdicts(verdicts, run.all_cases)
         overall = overall if not verdicts else replace(overall, sentence=unfinished_reason)
         return Evaluation(run, sampling, evidence, verdicts, overall)
     verdicts = [
-        _qualify(withhold_verdict(verdict, evidence), requirement, run, design, joint)
+        _mark_unverified(_qualify(withhold_verdict(verdict, evidence), requirement, run, design, joint), run)
         for verdict, requirement in zip(verdicts, run.requirements, strict=True)
     ]
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
     is_qualified = joint.is_confirmation and any(joint.is_qualified(verdict.requirement_id) for verdict in verdicts)
+    is_qualified = is_qualified or bool(verdicts and run.unverified)
     return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified)
+
+
+def _mark_unverified(verdict: Verdict, run: StoredRun) -> Verdict:
+    """Mark PASS of rows without a chain of hashes: nothing shows that they are those of the cases."""
+    is_pass = verdict.status is Status.PASS or verdict.status.is_qualified
+    return replace(verdict, status=Status.UNVERIFIED) if run.unverified and is_pass else verdict
+
+
+def _describe_wrong_rows(run: StoredRun) -> str:
+    """Describe that the rows are not one for each case of a finished campaign; empty if they are."""
+    numbers = run.all_cases["case"].tolist() if "case" in run.all_cases else []
+    cases = int(run.record.get("cases") or len(numbers))
+    if sorted(numbers) == list(range(cases)):
+        return ""
+    return f"The rows are not those of {count(cases, 'case')}: a verdict needs one row for each case from 0."
 
 
 def _qualify(

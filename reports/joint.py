@@ -10,12 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.claims import Confirmation, requirement_key
+from marsyard.campaigns.definition.claims import Confirmation, hash_stored_definition, requirement_key
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.confirmation_record import find_own_entry, is_variant, list_related_claims, read_record
 from marsyard.campaigns.store.git_history import UNKNOWN, find_registration_problem
 from marsyard.reports.case_evidence import RequirementEvidence
+from marsyard.reports.decision import collect_evidence
+from marsyard.reports.sampling_design import SamplingDesign
+from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
 
@@ -87,12 +90,11 @@ class JointEvidence:
         return bool(self.registration_problem) or self.has_unpassed_variant(requirement_id)
 
     def has_unpassed_variant(self, requirement_id: str) -> bool:
-        """Whether an earlier claim about the same campaign has not passed a requirement, or is not finished."""
-        variants = [
-            entries[-1] for entries in self.related if self.own is not None and is_variant(entries[-1], self.own)
-        ]
-        return any(
-            entry.is_unfinished or (entry.results or {}).get(requirement_id) not in _PASSED for entry in variants
+        """Whether an earlier claim about the campaign (`is_variant`) has not passed a requirement, or is unfinished."""
+        own = self.own
+        variants = [entries[-1] for entries in self.related if own is not None and is_variant(entries[-1], own)]
+        return own is not None and any(
+            entry.is_unfinished or not _has_passed(entry, own, requirement_id) for entry in variants
         )
 
     @property
@@ -109,6 +111,22 @@ class JointEvidence:
         return tuple(texts)
 
 
+def _has_passed(entry: Confirmation, own: Confirmation, requirement_id: str) -> bool:
+    """Whether an earlier claim has passed a requirement of a claim (`own`), or all of its own if it has another one.
+
+    Between campaigns of the catalogue the name identifies the requirement; in a user's campaign the content does.
+    """
+    results = entry.results or {}
+    if entry.is_included and own.is_included:
+        return results.get(requirement_id) in _PASSED
+    common = [
+        entry.requirements[key]
+        for key, name in own.requirements.items()
+        if name == requirement_id and key in entry.requirements
+    ]
+    return all(results.get(name) in _PASSED for name in common or results)
+
+
 def _describe_claim(entries: Sequence[Confirmation]) -> str:
     """Describe a claim by its campaign, its algorithm and its latest results."""
     entry = entries[-1]
@@ -116,6 +134,39 @@ def _describe_claim(entries: Sequence[Confirmation]) -> str:
     results = "not finished" if entry.is_unfinished else results
     claim = f"claim {entry.claim[:8]}" if entry.is_chained else "an earlier version"
     return f"{entry.campaign} with {entry.frozen.algorithm} ({claim}, {entry.started_utc[:10]}): {results}"
+
+
+def find_record_changes(run: StoredRun, own: Confirmation | None, design: SamplingDesign) -> list[str]:
+    """Describe how a folder differs from the entry of its run in the record of confirmations, each in a few words.
+
+    Its definition and requirements can differ, and after the result was recorded also the numbers of its cases.
+    """
+    if own is None:
+        return []
+    definition, cases, changes = run.definition, len(run.all_cases), []
+    if (definition.get("cases"), definition.get("max_cases")) != (own.first_cases, own.max_cases) or (
+        own.definition and hash_stored_definition(definition) != own.definition
+    ):
+        changes.append("a definition other than that in the record")
+    requirements = {requirement_key(item): str(item.get("id")) for item in run.requirements}
+    if requirements != own.requirements:
+        changes.append("requirements other than those in the record")
+    if cases > own.cases:
+        changes.append(f"{count(cases, 'case')}, {own.cases:,} in the record")
+    elif not changes and cases == own.counted_cases and collect_counts(run, own, design) != own.counts:
+        changes.append("results of cases other than those in the record")
+    return changes
+
+
+def collect_counts(run: StoredRun, own: Confirmation, design: SamplingDesign) -> dict[str, Any]:
+    """Count the cases of each requirement for the record of confirmations, by `requirement_key`."""
+    parts = {
+        requirement_key(requirement): collect_evidence(
+            run.all_cases, requirement, design, has_own_terrains=bool(own.bank_seeds)
+        )
+        for requirement in run.requirements
+    }
+    return {key: part.to_table() for key, part in parts.items() if part is not None}
 
 
 def read_joint_evidence(evidence: Evidence) -> JointEvidence:

@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 
-from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.store.confirmations import add_result
-from marsyard.reports.decision import collect_evidence
 from marsyard.reports.evaluation import Evaluation
-from marsyard.reports.joint import read_joint_evidence
+from marsyard.reports.joint import collect_counts, read_joint_evidence
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
@@ -22,11 +20,7 @@ def record_look(evaluation: Evaluation) -> None:
     own = read_joint_evidence(evidence).own
     if own is None:  # stated in the verdict
         return
-    design, counts = evaluation.sampling.with_open_end, {}
-    for requirement in run.requirements:
-        part = collect_evidence(run.all_cases, requirement, design, has_own_terrains=bool(own.bank_seeds))
-        if part is not None:
-            counts[requirement_key(requirement)] = part.to_table()
+    counts = collect_counts(run, own, evaluation.sampling.with_open_end)
     results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
     add_result(evidence, len(run.all_cases), results, counts)
 

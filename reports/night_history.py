@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -56,7 +57,7 @@ class MetricChange:
     """A changed metric.
 
     - is_rate: whether the metric is a success rate (larger is better), not an error
-    - before, now: rate or median error in the earlier nights and in this night
+    - before, now: rate or median error in the earlier nights and in this night; `now` is NaN without its column
     - p_value: p-value with Holm correction for the number of metrics compared in this night
     - nights: number of earlier nights
     """
@@ -71,7 +72,9 @@ class MetricChange:
 
     @property
     def is_regression(self) -> bool:
-        """Whether the change is a regression."""
+        """Whether the change is a regression; a metric without its column is one."""
+        if math.isnan(self.now):
+            return True
         return self.now < self.before if self.is_rate else self.now > self.before
 
 
@@ -176,6 +179,19 @@ class History:
             (night, campaign.name, metric, campaign.definition, FINISHED, night, MAX_EARLIER_NIGHTS),
         )
         return [_unpack(*row) for row in rows]
+
+    def missing_metrics(self, night: int, campaign: NightCampaign) -> list[Metric]:
+        """List the metrics of the previous finished night of a campaign that this night lacks, without values."""
+        rows = self._connection.execute(
+            """
+            SELECT figure, rate FROM figures WHERE campaign = :campaign AND night = (
+                SELECT MAX(n.night) FROM nights n JOIN campaigns c ON c.night = n.night
+                WHERE n.night < :night AND n.state = :state AND c.name = :campaign AND c.definition = :definition)
+            AND figure NOT IN (SELECT figure FROM figures WHERE campaign = :campaign AND night = :night) ORDER BY rowid
+            """,
+            {"night": night, "campaign": campaign.name, "state": FINISHED, "definition": campaign.definition},
+        )
+        return [Metric(name, bool(is_rate), _unpack(b"", b"")) for name, is_rate in rows]
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

@@ -24,7 +24,7 @@ _MIN_EXCEEDANCES = 10
 
 @dataclass(frozen=True)
 class NightComparison:
-    """A metric of one night, and its samples in earlier nights (`before`)."""
+    """A metric of one night, and its samples in earlier nights (`before`); without values if its column is missing."""
 
     campaign: str
     metric: Metric
@@ -32,16 +32,24 @@ class NightComparison:
 
 
 def find_changes(comparisons: Sequence[NightComparison]) -> list[MetricChange]:
-    """Find the changed metrics of a night; a false alarm has at most the probability `MAX_FALSE_ALARM_PROBABILITY`."""
+    """Find the changed metrics of a night; a false alarm has at most the probability `MAX_FALSE_ALARM_PROBABILITY`.
+
+    A metric whose column is missing has changed with certainty.
+    """
     earlier_samples = [_join_samples(comparison.before) for comparison in comparisons]
     # Holm's method compares the smallest p-value with the significance level divided by the number of metrics
     permutations = math.ceil(_MIN_EXCEEDANCES * len(comparisons) / _SIGNIFICANCE)
     p_values = correct_holm(
         [
-            math.nan if sample is None else difference_p_value(comparison.metric.sample, sample, permutations)
+            math.nan
+            if sample is None or _is_missing(comparison)
+            else difference_p_value(comparison.metric.sample, sample, permutations)
             for comparison, sample in zip(comparisons, earlier_samples, strict=True)
         ]
     )
+    p_values = [
+        0.0 if _is_missing(comparison) else p_value for comparison, p_value in zip(comparisons, p_values, strict=True)
+    ]
     return [
         MetricChange(
             campaign=comparison.campaign,
@@ -57,6 +65,12 @@ def find_changes(comparisons: Sequence[NightComparison]) -> list[MetricChange]:
     ]
 
 
+def _is_missing(comparison: NightComparison) -> bool:
+    """Whether the rows of the night lack the column of a metric."""
+    had_values = any(sample.values.size for sample in comparison.before)
+    return had_values and not comparison.metric.sample.values.size
+
+
 def _join_samples(samples: Sequence[Sample]) -> Sample | None:
     """Join the samples of several nights; None without a sample."""
     if not samples:
@@ -67,11 +81,11 @@ def _join_samples(samples: Sequence[Sample]) -> Sample | None:
 
 
 def list_comparisons(history: History, night: int) -> list[NightComparison]:
-    """List every metric of a night with its samples in earlier nights."""
+    """List every metric of a night, and of the night before it, with its samples in earlier nights."""
     return [
         NightComparison(campaign.name, metric, history.earlier_samples(night, campaign, metric.name))
         for campaign in history.campaigns(night)
-        for metric in history.metrics(night, campaign.name)
+        for metric in (*history.metrics(night, campaign.name), *history.missing_metrics(night, campaign))
     ]
 
 
@@ -111,6 +125,9 @@ def format_night_page(
             lines += ["", f"## {title}", ""]
         for change in group_changes:
             before, now = ((percent if change.is_rate else number)(value) for value in (change.before, change.now))
+            if math.isnan(change.now):
+                lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: its column is missing now")
+                continue
             values = f"{before} in {count(change.nights, 'earlier night')}, {now} now (p = {change.p_value:.1g})"
             lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: {values}")
     text = (

@@ -112,6 +112,11 @@ EXPLORATORY_PASS = "PASS (exploration)"  # noqa: S105  (a verdict, not a passwor
 QUALIFIED_EXIT_CODE = 4
 
 
+def describe_status(status: Status, *, is_exploration: bool) -> str:
+    """Return the word for a status; PASS of an exploration is marked."""
+    return EXPLORATORY_PASS if status is Status.PASS and is_exploration else str(status)
+
+
 @dataclass(frozen=True)
 class OverallVerdict:
     """Verdict of a campaign.
@@ -136,9 +141,9 @@ class OverallVerdict:
     @property
     def word(self) -> str:
         """The headline."""
-        if self.status is Status.PASS and self.is_exploration:
-            return EXPLORATORY_PASS
-        return self.without_status if self.status is None else str(self.status)
+        if self.status is None:
+            return self.without_status
+        return describe_status(self.status, is_exploration=self.is_exploration)
 
 
 def combine_verdicts(
@@ -188,6 +193,7 @@ def _combine_verdicts(
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
+        Status.UNVERIFIED: f"{fraction} met, but the rows are not verified: the folder has no cases.sqlite.",
         Status.UNREGISTERED: f"{fraction} met, but no registered record shows the earlier runs.",
         Status.OTHER_CLAIMS: f"{fraction} met, after other claims about this campaign that did not pass.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",

@@ -14,7 +14,8 @@ from marsyard.reports.column_values import numbers
 def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
     """Create the mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
 
-    Cases with a missing value and unfinished cases are failures. A metric may be a sum of columns, joined by " + ".
+    Cases with a missing value and unfinished cases are failures. A metric may be a sum of columns, joined by " + ":
+    the magnitude is that of the sum.
     """
     is_finished = ~engine_failed(frame)
     if math.isnan(bound):

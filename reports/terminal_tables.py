@@ -20,6 +20,7 @@ _STYLES = {
     Status.MET_BY_RATE: "bold cyan",
     Status.FAIL: "bold red",
     Status.INSUFFICIENT: "bold yellow",
+    Status.UNVERIFIED: "bold cyan",
     Status.UNREGISTERED: "bold cyan",
     Status.OTHER_CLAIMS: "bold cyan",
 }

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from marsyard.reports.overall import OverallVerdict
+from marsyard.campaigns.definition.evidence import EvidenceKind
+from marsyard.reports.overall import OverallVerdict, describe_status
 from marsyard.reports.provenance import Algorithm, format_tested_algorithms
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
@@ -42,14 +43,18 @@ COLUMNS = (*_REQUIREMENT_COLUMNS, "campaign", *algorithm_cells(()), *_EVIDENCE_C
 def requirement_evidence(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = (), evidence_kind: str = ""
 ) -> list[dict[str, Any]]:
-    """Create the rows of the traceability matrix: the evidence of a campaign for each requirement."""
+    """Create the rows of the traceability matrix: the evidence of a campaign for each requirement.
+
+    evidence_kind: title of the kind of evidence (`Evidence.title`)
+    """
     cells = {"campaign": campaign, **algorithm_cells(algorithms), "evidence": evidence_kind}
     rows = []
     for verdict in verdicts:
         evidence = {column: getattr(verdict, name) for column, name in _EVIDENCE_COLUMNS.items()}
         if verdict.all_cases is not None:
             evidence |= {column: getattr(verdict.all_cases, name) for column, name in _ALL_CASES_COLUMNS.items()}
-        evidence["verdict"] = str(verdict.status)
+        is_exploration = evidence_kind == EvidenceKind.EXPLORATION
+        evidence["verdict"] = describe_status(verdict.status, is_exploration=is_exploration)
         evidence["metric"] = verdict.metric if verdict.scale == 1.0 else f"{verdict.scale:g} * ({verdict.metric})"
         rows.append(
             {column: getattr(verdict, name) for column, name in _REQUIREMENT_COLUMNS.items()} | cells | evidence
@@ -83,8 +88,8 @@ def junit_xml(
 ) -> str:
     """Format the verdicts as JUnit XML: a test for each requirement, and one for the completion of all cases.
 
-    FAIL is a failure; INSUFFICIENT, MET BY RATE and PASS with a qualification are skipped. Properties of the suite: the
-    tested algorithm.
+    FAIL is a failure; INSUFFICIENT, MET BY RATE and PASS with a qualification are skipped; PASS of an exploration is
+    named in the output of its test. Properties of the suite: the tested algorithm.
     """
     statuses = [verdict.status for verdict in verdicts]
     suite = Xml.Element(
@@ -113,7 +118,9 @@ def junit_xml(
             Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
         elif verdict.status is not Status.PASS:
             Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
-        Xml.SubElement(test_case, "system-out").text = _clean_xml(f"{tested_text}{verdict.statement} {message}")
+        word = describe_status(verdict.status, is_exploration=overall.is_exploration)
+        text = f"{word}. {tested_text}{verdict.statement} {message}"
+        Xml.SubElement(test_case, "system-out").text = _clean_xml(text)
     completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")
     if overall.crashed:
         Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")

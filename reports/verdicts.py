@@ -29,6 +29,8 @@ class Status(StrEnum):
     FAIL = "FAIL"
     INSUFFICIENT = "INSUFFICIENT"
     MET_BY_RATE = "MET BY RATE"
+    #: PASS of rows without a chain of hashes, which shows whether rows were changed.
+    UNVERIFIED = "PASS (unverified)"
     #: PASS of a confirmation whose record of earlier runs is missing, broken or not registered.
     UNREGISTERED = "PASS (unregistered)"
     #: PASS of a confirmation after other claims about the same campaign without PASS.
@@ -38,7 +40,7 @@ class Status(StrEnum):
     @property
     def is_qualified(self) -> bool:
         """Whether it is PASS that needs a decision of a person."""
-        return self in (Status.UNREGISTERED, Status.OTHER_CLAIMS)
+        return self in (Status.UNVERIFIED, Status.UNREGISTERED, Status.OTHER_CLAIMS)
 
     @property
     def is_met(self) -> bool:

@@ -71,7 +71,7 @@ class AttitudeMeasurement:
 
 @dataclass(frozen=True)
 class AltitudeMeasurement:
-    """Altitude above the ground with its time tag: the range of a radar to the nearest ground; NaN without a reading."""
+    """Altitude above the ground with its time tag: range of a radar to the nearest ground; NaN without a reading."""
 
     altitude_m: float
     time_s: float

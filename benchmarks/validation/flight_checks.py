@@ -70,8 +70,8 @@ FLOWN_PAIRS = {"repeatability": "0.54", "tracking_error_px": "0.39", "decorrelat
 _NO_PAIR = PairStatistics(*[np.nan] * len(PairStatistics._fields))
 #: First seed of the compared terrains: parameters of the sites were set on other seeds.
 FIRST_SEED = 9900
-#: Number of terrains of the descent images. The median patchiness of 20 terrains has a standard deviation of 0.10 between
-#: sets of terrains (bootstrap), as much as its distance to the limits.
+#: Number of terrains of the descent images. The median patchiness of 20 terrains has a standard deviation of 0.10
+#: (bootstrap over terrains), as much as its distance to the limits.
 _TERRAINS = 100
 
 

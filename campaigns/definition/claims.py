@@ -36,6 +36,8 @@ DEFINITION = "configuration"
 _KEYS_NOT_HASHED = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "name", "requirements", "retain", "seed"}
 )
+#: Texts of a dispersion or of a group of correlated dispersions, which describe it and do not change its draws.
+_TEXTS = frozenset({"description", "source", "unit"})
 #: Keys of a requirement that determine its verdict.
 _REQUIREMENT_KEYS = ("metric", "bound", "probability", "confidence", "population", "decide_by", "accept_rate", "scale")
 #: Name of the parameters that seed the terrains of a bank; a confirmation derives them.
@@ -48,8 +50,8 @@ class FrozenAlgorithm:
 
     - algorithm: name of the algorithm under test
     - options: options of all algorithms of the campaign, under the algorithm's name, and values under `parameters`
-    - hashes: SHA-256 of `sources` (of the algorithms, with their options), `DEFINITION` (parameters, dispersions,
-      sampling design, input files), `requirements`, and `code` (of the simulation)
+    - hashes: SHA-256 of `sources` (of the algorithms, with their options), `DEFINITION` (parameters, dispersions
+      without their texts, sampling design, input files), `requirements`, and `code` (of the simulation)
     """
 
     algorithm: str
@@ -97,6 +99,9 @@ class Confirmation:
     - first_cases: number of cases of its first look
     - max_cases: maximum number of cases of a run with `--until-decided`; otherwise None
     - overlap: see `Evidence`
+    - scenario: scenario of its campaign; empty if it was not recorded
+    - definition: `hash_stored_definition` of its run; empty if it was not recorded
+    - is_included: whether the campaign is one of the catalogue, without a change
     - requirements: name of each requirement, by `requirement_key`
     - results: status of each requirement at the latest look, by name; None before the first look
     - counted_cases, counts: number of cases and evidence of the latest look (`marsyard.reports.joint`)
@@ -119,6 +124,9 @@ class Confirmation:
     first_cases: int = 0
     max_cases: int | None = None
     overlap: float | None = None
+    scenario: str = ""
+    definition: str = ""
+    is_included: bool = True
     requirements: Mapping[str, str] = field(default_factory=dict)
     counted_cases: int = 0
     counts: Mapping[str, Any] = field(default_factory=dict)
@@ -130,6 +138,11 @@ class Confirmation:
     def is_unfinished(self) -> bool:
         """Whether the record announces more cases than it has results of."""
         return self.results is None or (self.is_chained and self.counted_cases < self.cases)
+
+    @property
+    def parameter_names(self) -> frozenset[str]:
+        """Names of the scenario's parameters and tables of parameters, which identify a scenario without its name."""
+        return frozenset(path.split(".")[1] for path in self.frozen.options if path.startswith("parameters."))
 
 
 def hash_json(content: Any) -> str:
@@ -145,7 +158,7 @@ def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
     options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
     values = definition.model_dump(mode="json")
     options |= dict(leaves(values["parameters"], "parameters"))
-    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
+    frozen_values = _remove_texts(values)
     frozen_values["parameters"] = _remove_names(campaign, values["parameters"])
     contents = {
         "sources": [[entry["role"], _algorithm_content(campaign, entry), entry["options"]] for entry in algorithms],
@@ -154,6 +167,24 @@ def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
         "code": hash_code((scenario_source(definition.scenario), *list_parts(definition))),
     }
     return FrozenAlgorithm(algorithm, options, {name: hash_json(content) for name, content in contents.items()})
+
+
+def hash_stored_definition(values: Mapping[str, Any]) -> str:
+    """Compute the hash of the definition in the record of a run, except names, texts, limits and requirements."""
+    return hash_json(_remove_texts(values))
+
+
+def _remove_texts(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of a definition without `_KEYS_NOT_HASHED`, and without the texts of its dispersions."""
+
+    def remove(table: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in table.items() if name not in _TEXTS}
+
+    kept = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
+    dispersions, correlations = kept.get("dispersions") or {}, kept.get("correlations") or ()
+    kept["dispersions"] = {path: remove(dispersion) for path, dispersion in dispersions.items()}
+    kept["correlations"] = [remove(group) for group in correlations]
+    return kept
 
 
 def _remove_names(campaign: Campaign, parameters: Mapping[str, Any]) -> Any:

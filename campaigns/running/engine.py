@@ -181,7 +181,7 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
             return
         evidence = Evidence.read(stored.get("evidence"))
         if evidence.kind is EvidenceKind.CONFIRMATION and evidence.claim:
-            extend_confirmation(evidence, definition.total_cases)
+            extend_confirmation(evidence, definition.total_cases, repeats=bool(retries))
         session = record.describe_session(command, run.executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]

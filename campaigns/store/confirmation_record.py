@@ -5,7 +5,8 @@ version control, next to the algorithm; entries are never changed or removed. Ki
 
 - `chain`: beginning of the chain; lines before it are entries of earlier versions
 - `start`: a confirmation before its first case, with its content, seeds and number of cases
-- `extension`: a larger number of cases of a confirmation (`marsyard append`, `--until-decided`)
+- `extension`: cases that a confirmation will run: more of them (`marsyard append`, `--until-decided`), or crashed ones
+  again (`marsyard resume --retry`)
 - `result`: statuses of the requirements at a look, and the evidence that later looks need
 """
 
@@ -25,6 +26,8 @@ _KINDS = ("chain", "start", "extension", "result")
 #: Keys of the start of a confirmation; those of earlier versions have no `claim`.
 _START_KEYS = ("campaign", "number", "seed", "started_utc", "git_commit", "folder", "cases")
 _CHAINED_KEYS = ("claim", "bank_seeds", "first_cases", "max_cases", "overlap", "requirements")
+#: Keys that the first entries of this project's record lack.
+_ADDED_KEYS = ("scenario", "definition", "is_included")
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[s
     key = (str(stored["claim"]), int(stored["number"]))
     if kind == "start":
         values = {name: stored[name] for name in (*_START_KEYS, *_CHAINED_KEYS)}
+        values |= {name: stored[name] for name in _ADDED_KEYS if name in stored}
         entry = Confirmation(frozen=FrozenAlgorithm.read(stored["frozen"]), head=head, **values)
         claim_entries = [item for item in entries.values() if item.is_chained and item.claim == entry.claim]
         if entry.claim != entry.frozen.claim or entry.number != len(claim_entries) + 1:
@@ -114,7 +118,8 @@ def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[s
             raise ValueError("the seed does not follow from the claim and the entries before it")
         entries[key] = entry
     elif kind == "extension":
-        entries[key] = replace(entries[key], cases=int(stored["cases"]), head=head)
+        # results before the announced cases are not those of the present rows
+        entries[key] = replace(entries[key], cases=int(stored["cases"]), counted_cases=0, head=head)
     else:
         entry, results = entries[key], dict(stored["results"])
         failed = (*entry.failed, *(name for name, status in results.items() if status == "FAIL"))
@@ -140,8 +145,7 @@ def list_related_claims(record: ConfirmationRecord, own: Sequence[Confirmation])
 
     - own: the confirmations of the claim
 
-    Another claim is related by the name of the campaign, the algorithm, the content of its definition, or a
-    requirement.
+    Another claim is related by the campaign (`is_variant`), the algorithm, or a requirement.
     """
     entries = record.confirmations
     earlier = entries[: max(entries.index(entry) for entry in own)]
@@ -160,7 +164,14 @@ def list_related_claims(record: ConfirmationRecord, own: Sequence[Confirmation])
     return list(related.values())
 
 
-def is_variant(entry: Confirmation, other: Confirmation) -> bool:
-    """Whether two claims are about the same campaign: by its name, or by the content of its definition."""
-    own_content, other_content = (item.frozen.hashes.get(DEFINITION) for item in (entry, other))
-    return entry.campaign == other.campaign or own_content == other_content
+def is_variant(entry: Confirmation, own: Confirmation) -> bool:
+    """Whether an earlier claim can be about the same campaign as a claim (`own`).
+
+    By the name or the content of the campaign. A campaign of the user can also be a renamed or changed copy of every
+    other campaign of its scenario; only an unchanged campaign of the catalogue cannot.
+    """
+    content, own_content = (item.frozen.hashes.get(DEFINITION) for item in (entry, own))
+    if entry.campaign == own.campaign or content == own_content:
+        return True
+    is_same_scenario = entry.scenario == own.scenario or entry.parameter_names == own.parameter_names
+    return is_same_scenario and not own.is_included

@@ -10,11 +10,14 @@ from typing import IO, Any
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.claims import (
+    DEFINITION,
     Confirmation,
+    FrozenAlgorithm,
     bank_seeds,
     confirmation_bank_seeds,
     confirmation_seed,
     freeze_algorithm,
+    hash_stored_definition,
     requirement_key,
 )
 from marsyard.campaigns.definition.evidence import (
@@ -24,10 +27,16 @@ from marsyard.campaigns.definition.evidence import (
     classify_evidence,
     uses_imported_terrain,
 )
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.parameter_paths import find_value, replace_values
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.confirmation_record import ConfirmationRecord, find_own_entry, parse_record, read_record
-from marsyard.campaigns.store.git_history import find_campaign_file_problem, find_registration_problem, git_commit
+from marsyard.campaigns.store.git_history import (
+    find_campaign_file_problem,
+    find_registration_problem,
+    git_commit,
+    is_catalogue_file,
+)
 from marsyard.campaigns.store.record import utc_now
 from marsyard.scenarios.interface import HasAlgorithms
 
@@ -112,6 +121,9 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
                 "first_cases": definition.cases,
                 "max_cases": definition.max_cases,
                 "overlap": campaign.calibration_overlap,
+                "scenario": definition.scenario,
+                "definition": hash_stored_definition(definition.model_dump(mode="json")),
+                "is_included": _is_included(campaign, frozen),
                 "requirements": {
                     requirement_key(item.model_dump(mode="json")): item.id for item in definition.requirements
                 },
@@ -134,6 +146,14 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     )
 
 
+def _is_included(campaign: Campaign, frozen: FrozenAlgorithm) -> bool:
+    """Whether a campaign is one of the catalogue, without a change of its definition or requirements."""
+    if campaign.file is None or not is_catalogue_file(campaign.file):
+        return False
+    hashes = freeze_algorithm(load_campaign(str(campaign.file))).hashes
+    return all(hashes[name] == frozen.hashes[name] for name in (DEFINITION, "requirements"))
+
+
 def _check_repetition(cases: int, max_cases: int | None, entry: Confirmation) -> None:
     """Raise CampaignError if a run has not the number of cases of the unfinished confirmation that it repeats.
 
@@ -148,12 +168,15 @@ def _check_repetition(cases: int, max_cases: int | None, entry: Confirmation) ->
     )
 
 
-def extend_confirmation(evidence: Evidence, cases: int) -> None:
-    """Announce a larger number of cases of a confirmation in its record. Raises StoreError like `add_result`."""
+def extend_confirmation(evidence: Evidence, cases: int, *, repeats: bool = False) -> None:
+    """Announce a larger number of cases of a confirmation in its record. Raises StoreError like `add_result`.
+
+    repeats: whether crashed cases run again, so that the counts in the record will change
+    """
     path = Path(evidence.record)
     with _open_locked(path) as file:
         record, entry = _find_own_entry(path, file, evidence)
-        if cases > entry.cases:
+        if cases > entry.cases or repeats:
             values = {"claim": entry.claim, "number": entry.number, "cases": cases, "utc": utc_now()}
             _append(file, "extension", values, record.head)
 

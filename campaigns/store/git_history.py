@@ -80,12 +80,17 @@ def find_campaign_file_problem(record: Path, campaign_file: Path | None) -> str:
 
     Campaigns of the catalogue, and those without a file (None), may be confirmed in any repository.
     """
-    path = None if campaign_file is None else campaign_file.resolve()
-    if path is None or path.is_relative_to(_PACKAGE_FOLDER / "scenarios"):
+    if campaign_file is None or is_catalogue_file(campaign_file):
         return ""
+    path = campaign_file.resolve()
     if _find_repository(path.parent) == _find_repository(record.resolve().parent):
         return ""
     return f"{UNKNOWN}: {path} is not in the git repository of {record}."
+
+
+def is_catalogue_file(campaign_file: Path) -> bool:
+    """Whether a campaign file is part of the program."""
+    return campaign_file.resolve().is_relative_to(_PACKAGE_FOLDER / "scenarios")
 
 
 def _find_repository(folder: Path) -> str | None:

@@ -100,7 +100,8 @@ def evaluate_and_store(directory: Path, requirements: Requirements | None = None
 def _comparison_tables(frame: pd.DataFrame, requirements: Requirements, verdicts: Sequence[Verdict]) -> list[Table]:
     """Compare algorithms on the same cases; return no table for a single algorithm."""
     metric = primary_metric(frame, requirements)
-    bound = next((item.bound for item in verdicts if item.metric == metric and math.isfinite(item.bound)), None)
+    bounds = (item.bound / item.scale for item in verdicts if item.metric == metric)
+    bound = next((bound for bound in bounds if math.isfinite(bound)), None)
     algorithms, differences = compare_algorithms(frame, metric, bound)
     if not algorithms:
         return []

@@ -1,11 +1,14 @@
 """Rows of the dashboard's table: one per requirement, with its verdicts in all campaigns."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.reports.dashboard.entries import Entry
+from marsyard.reports.overall import EXPLORATORY_PASS, describe_status
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
@@ -38,13 +41,25 @@ class Cell:
     entry: Entry
     verdict: Verdict
 
+    @property
+    def word(self) -> str:
+        """The status; PASS of an exploration is marked."""
+        is_exploration = self.entry.report.evidence.kind is EvidenceKind.EXPLORATION
+        return describe_status(self.verdict.status, is_exploration=is_exploration)
+
+    @property
+    def is_confirmation(self) -> bool:
+        """Whether the campaign is a confirmation, which precedes all explorations."""
+        return self.entry.report.evidence.is_confirmation
+
 
 @dataclass(frozen=True)
 class RequirementRow:
-    """A requirement, its latest verdict for each campaign name, and the trend of the latest campaign.
+    """A requirement, its latest verdict for each campaign name, and the trend of the first of these campaigns.
 
-    - cells: latest verdict for each campaign name
-    - all_cells: verdicts of all campaigns, the latest first, unfinished campaigns last
+    - cells: verdict for each campaign name, the first one in the order of `all_cells`
+    - all_cells: verdicts of all campaigns: confirmations, then other campaigns, then unfinished ones, each the latest
+      first
     - studies: latest study of each kind and campaign name
     """
 
@@ -59,7 +74,7 @@ class RequirementRow:
 
     @property
     def latest(self) -> Cell | None:
-        """Verdict of the latest campaign, preferably a finished campaign; None without a campaign."""
+        """Verdict of the latest confirmation, or of the latest campaign without one; None without a campaign."""
         return self.cells[0] if self.cells else None
 
 
@@ -73,13 +88,17 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
             cells.setdefault(entry.report.study.requirement, [])
     rows = []
     for name, unsorted_cells in cells.items():
-        sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.is_finished)
+        sorted_cells = sorted(unsorted_cells, key=lambda cell: (not cell.entry.is_finished, not cell.is_confirmation))
         latest_by_campaign: dict[str, Cell] = {}
         for cell in sorted_cells:
             latest_by_campaign.setdefault(cell.entry.name, cell)
         latest = list(latest_by_campaign.values())
         history = [
-            cell.verdict for cell in sorted_cells if cell.entry.name == latest[0].entry.name and cell.entry.is_finished
+            cell.verdict
+            for cell in sorted_cells
+            if cell.entry.name == latest[0].entry.name
+            and cell.entry.is_finished
+            and cell.is_confirmation == latest[0].is_confirmation
         ]
         requirement, kind, source = shared.get(name), "", ""
         statement = latest[0].verdict.statement if latest else ""
@@ -92,9 +111,10 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
                 studies.setdefault(entry.title, entry)
         line = sparkline(history[::-1])
         rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
-    # failed requirements first, those without a campaign last
-    order = {None: len(Status)} | {status: index for index, status in enumerate(Status)}
-    return sorted(rows, key=lambda row: order[row.latest.verdict.status if row.latest else None])
+    # failed requirements first, then PASS of explorations before PASS, those without a campaign last
+    words = [*map(str, Status), EXPLORATORY_PASS, Status.PASS]
+    order = {word: index for index, word in enumerate(words)} | {None: len(words)}
+    return sorted(rows, key=lambda row: order[row.latest.word if row.latest else None])
 
 
 def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
@@ -119,9 +139,8 @@ def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
 
 
 def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
-    """Count the requirements per latest verdict; requirements without a campaign come last."""
-    statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
-    counts = [(str(status), statuses.count(status)) for status in Status if status in statuses]
+    """Count the requirements per verdict in the order of the rows; requirements without a campaign come last."""
+    counts = [*Counter(row.latest.word for row in rows if row.latest is not None).items()]
     n_missing = sum(row.latest is None for row in rows)
     return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 

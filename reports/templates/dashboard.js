@@ -19,7 +19,7 @@
   };
   // as `reports.dashboard.entries.sparkline`
   const drawSparkline = (cells) => {
-    const finished = cells.filter((cell) => cell.finished && cell.name === cells[0].name && cell.rate !== null && cell.required !== null);
+    const finished = cells.filter((cell) => cell.finished && cell.name === cells[0].name && cell.confirmation === cells[0].confirmation && cell.rate !== null && cell.required !== null);
     const latestCells = finished.slice(0, LATEST).reverse();
     if (latestCells.length < 2) return [];
     let low = Math.min(...latestCells.flatMap((cell) => [cell.rate, cell.required]));
@@ -51,7 +51,7 @@
       basis.textContent = latest.basis;
       verdict.replaceChildren(badge.cloneNode(true), basis);
     }
-    else verdict.textContent = "no campaign fits";
+    else verdict.textContent = latest ? latest.status : "no campaign fits";
     const list = document.createElement("ul"), names = new Set();
     for (const cell of cells) {
       if (names.has(cell.name) || names.size > MAX_OTHER) continue;

@@ -107,6 +107,20 @@ def set_a_parameter(marsyard: Command, folder: Path) -> list[Output]:
     return [marsyard(*CONFIRM, folder / "run-set", "--set", "error_scale=0.5")]
 
 
+def rename_a_copy_and_its_texts(marsyard: Command, folder: Path) -> list[Output]:
+    text = CAMPAIGN.replace('"fake"', '"copy"').replace("high = 99", 'high = 99, source = "other", unit = "-"')
+    (folder / "fake.toml").write_text(f'description = "other"\n{text}')
+    return [marsyard(*CONFIRM, folder / "run-copy")]
+
+
+def rename_a_copy_and_change_a_width(marsyard: Command, folder: Path) -> list[Output]:
+    text = CAMPAIGN.replace('"fake"', '"copy"').replace("high = 99", "high = 98")
+    (folder / "estimator.py").write_text("class Better:\n    version = 2\n")
+    (folder / "fake.toml").write_text(text.replace("VELOCITY", "V").replace("estimator:Estimator", "estimator:Better"))
+    commit_all(folder)
+    return [marsyard(*CONFIRM, folder / "run-copy")]
+
+
 def weaken_the_requirement_in_a_copy(marsyard: Command, folder: Path) -> list[Output]:
     text = CAMPAIGN.replace("probability = 0.75", "probability = 0.5").replace('"fake"', '"copy"')
     (folder / "copy.toml").write_text(text.replace("VELOCITY", "VELOCITY-2"))
@@ -171,6 +185,8 @@ ATTEMPTS: list[tuple[Attempt, Expected, str]] = [
     (rename_the_class, [OTHER_CLAIMS], "Other claims: 1: fake with estimator:Estimator"),
     (rename_the_module, [FAIL], "joint evidence of the confirmations 1, 2 of this claim"),
     (set_a_parameter, [OTHER_CLAIMS], "VELOCITY FAIL"),
+    (rename_a_copy_and_its_texts, [FAIL], "joint evidence of the confirmations 1, 2 of this claim"),
+    (rename_a_copy_and_change_a_width, [OTHER_CLAIMS], "Other claims: 1: fake"),
     (weaken_the_requirement_in_a_copy, [OTHER_CLAIMS], "Other claims: 1: fake"),
     (edit_the_record, [UNREGISTERED, INVALID, UNREGISTERED], "is not the beginning of"),
     (shorten_the_record, [UNREGISTERED], "is not the beginning of"),
@@ -180,8 +196,18 @@ ATTEMPTS: list[tuple[Attempt, Expected, str]] = [
 ]
 
 
+#: A scenario with one more parameter.
+OTHER_SCENARIO = """
+from tests.campaigns.fake_scenario import TestedParameters, TestedScenario
+
+class OtherParameters(TestedParameters):
+    gravity_m_s2: float = 3.71
+
+class World(TestedScenario):
+    parameters_type = OtherParameters
+"""
 #: Attempts of the suite; the others are made in `make validate`.
-QUICK = {"repeat", "delete_the_record", "reuse_a_seed", "edit_the_record"}
+QUICK = {"repeat", "rename_a_copy_and_change_a_width", "delete_the_record", "reuse_a_seed", "edit_the_record"}
 
 
 @pytest.mark.parametrize(
@@ -204,10 +230,9 @@ def test_attempt_gives_no_unqualified_pass(
 
 
 def test_cases_of_the_attempts_alone_would_pass(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The repository of the attempts gives PASS for an algorithm without earlier claims about its campaign."""
-    (project / "estimator.py").write_text("class Estimator:\n    version = 2\n")
-    (project / "fake.toml").write_text(CAMPAIGN.replace('"fake"', '"new"').replace("error_scale", "scale"))
-    text = (project / "fake.toml").read_text().replace("[dispersions]", "error_scale = 0.25\n[dispersions]")
+    """The repository of the attempts gives PASS for a campaign of another scenario."""
+    (project / "world.py").write_text(OTHER_SCENARIO)
+    text = CAMPAIGN.replace('"fake"', '"new"').replace("tests.campaigns.fake_scenario:TestedScenario", "world:World")
     (project / "fake.toml").write_text(text)
     output = make_command(monkeypatch, project)(*CONFIRM, project / "run-new")
     assert (output.status, is_unqualified_pass(output), "verdict: PASS" in output.out) == (0, True, True)

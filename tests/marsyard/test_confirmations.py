@@ -6,6 +6,8 @@ confirmations is committed to git; `test_confirmation_attacks.py` contains attem
 
 import json
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,10 +16,18 @@ from marsyard.campaigns.definition.claims import confirmation_seed, freeze_algor
 from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.confirmation_record import read_record
-from marsyard.campaigns.store.confirmations import create_record
+from marsyard.campaigns.store.confirmation_record import is_variant, read_record
+from marsyard.campaigns.store.confirmations import (
+    create_record,
+    extend_confirmation,
+    reserve_confirmation,
+    select_confirmation_seed,
+)
 from marsyard.campaigns.store.git_history import find_registration_problem
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
+from marsyard.campaigns.store.table import write_table
 from marsyard.reports.assurance.package import MANIFEST, hash_files
+from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain.bank import TerrainBank
 from tests.marsyard.confirmation_project import (
     BAD_LUCK,
@@ -180,6 +190,76 @@ def test_other_requirements_invalidate_a_confirmation(marsyard: Command, tmp_pat
     (tmp_path / "requirements.toml").write_text(text + 'campaigns = ["fake"]\n')
     output = marsyard("report", "run-1", "--requirements", "requirements.toml")
     assert (output.status, "requirements other than those of the campaign" in output.text) == (3, True)
+
+
+def _weaken_requirement(run: Path) -> None:
+    path = run / "campaign.json"
+    path.write_text(path.read_text().replace('"probability": 0.75', '"probability": 0.5'))
+
+
+def _change_dispersion(run: Path) -> None:
+    path = run / "campaign.json"
+    path.write_text(path.read_text().replace('"high": 99', '"high": 9'))
+
+
+def _replace_row(run: Path) -> None:
+    """Replace the row of a case by one with a large error, in a folder whose rows this user signs."""
+    with RowStore(run / ROWS_FILE) as store:
+        row = store.row(0)
+        assert row is not None
+        store.add([{**row, "velocity_error_m_s": 1e9}])
+        write_table(run / "cases.parquet", store)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (_weaken_requirement, "requirements other than those in the record"),
+        (_change_dispersion, "a definition other than that in the record"),
+        (_replace_row, "results of cases other than those in the record"),
+    ],
+)
+def test_folder_that_contradicts_the_record_is_no_confirmation(
+    marsyard: Command, tmp_path: Path, change: Callable[[Path], None], text: str
+) -> None:
+    assert confirm(marsyard, "run-1") == (0, ["PASS"])
+    record = (tmp_path / RECORD).read_bytes()
+    change(tmp_path / "run-1")
+    output = marsyard("report", "run-1")
+    assert (output.status, "Not the frozen evaluation: " in output.text, text in output.text) == (3, True, True)
+    assert (tmp_path / RECORD).read_bytes() == record
+
+
+def test_repeated_cases_are_announced_and_their_results_recorded(marsyard: Command, tmp_path: Path) -> None:
+    """`marsyard resume --retry` replaces rows: the record then expects another result."""
+    confirm(marsyard, "run-1")
+    extend_confirmation(read_evidence(tmp_path / "run-1"), 10, repeats=True)
+    assert read_record(tmp_path / RECORD).confirmations[0].is_unfinished
+    _replace_row(tmp_path / "run-1")
+    output = marsyard("report", "run-1")
+    assert (output.status, "Not the frozen evaluation" in output.text) == (3, False)
+    (entry,) = read_record(tmp_path / RECORD).confirmations
+    assert (entry.is_unfinished, [counts["failures"] for counts in entry.counts.values()]) == (False, [1])
+
+
+def test_campaigns_of_the_catalogue_are_no_copies_of_each_other(tmp_path: Path) -> None:
+    """A copy of one with another name and width is related to all of its scenario, also to the original."""
+    file = catalogue()["dimes-smoke"]
+    copy = tmp_path / "copy.toml"
+    copy.write_text(file.read_text().replace('"dimes-smoke"', '"copy"').replace("high = 3.0", "high = 3.0001"))
+    entries = []
+    for name in ("dimes-smoke", "dimes-gusev", "hda-benign", str(copy)):
+        campaign = load_campaign(name)
+        path = tmp_path / RECORD
+        reserve_confirmation(select_confirmation_seed(replace(campaign, confirmations=path)), tmp_path)
+        entries.append(read_record(path).confirmations[-1])
+    assert [entry.is_included for entry in entries] == [True, True, True, False]
+    smoke, gusev, benign, changed = entries
+    assert (is_variant(smoke, gusev), is_variant(changed, smoke)) == (False, False)
+    assert [is_variant(entry, changed) for entry in (smoke, gusev, benign)] == [True, True, False]
+    changed_option = load_campaign("dimes-smoke", ["algorithm=dimes-plus", "dimes.min_peak=0.9"])
+    reserve_confirmation(select_confirmation_seed(replace(changed_option, confirmations=path)), tmp_path)
+    assert not read_record(path).confirmations[-1].is_included
 
 
 def test_seed_of_the_first_confirmation_is_recognised_without_record(marsyard: Command) -> None:

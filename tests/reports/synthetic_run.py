@@ -1,5 +1,6 @@
 """Folders of synthetic runs of descents, with rows of known statistics."""
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.campaigns.store.products import pack_products, save_packed
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 
 VELOCITY: Mapping[str, Any] = {
     "id": "DIMES-VEL",
@@ -155,6 +157,15 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
     }
 
 
+def write_table_with_seal(directory: Path, frame: pd.DataFrame) -> None:
+    """Write rows as a table, and a store that knows the table but contains no rows, so that it is fast."""
+    path = directory / "cases.parquet"
+    frame.to_parquet(path)
+    create_store(directory / ROWS_FILE, {})
+    with RowStore(directory / ROWS_FILE) as store:
+        store.record_table(hashlib.sha256(path.read_bytes()).hexdigest())
+
+
 def write_run(
     directory: Path,
     frame: pd.DataFrame,
@@ -165,7 +176,7 @@ def write_run(
 ) -> Path:
     """Write a run folder; `products` are stored for case 3, and `changes` replace entries of the record."""
     directory.mkdir(parents=True, exist_ok=True)
-    frame.to_parquet(directory / "cases.parquet")
+    write_table_with_seal(directory, frame)
     record = {**synthetic_record(frame, requirements), **changes}
     (directory / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
     if products is not None:

@@ -39,6 +39,18 @@ def test_paired_comparison_averages_the_cases_that_both_algorithms_answer() -> N
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
 
 
+def test_unfinished_cases_are_no_successes_and_have_no_error() -> None:
+    """A lander that flies on after a crash of the algorithm has an error, which is not the algorithm's."""
+    frame = make_paired_rows([0.5] * 100, [0.5] * 100)
+    is_crashed = frame["case"] < 60
+    frame["other.outcome"] = np.where(is_crashed, "CRASHED", "VALID")
+    frame["other.velocity_error_m_s"] = np.where(is_crashed, 0.1, 0.5)
+    (_, other), (difference,) = compare_algorithms(frame, "velocity_error_m_s", 1.0)
+    assert (other.failed, other.succeeded, other.median) == (60, 40, 0.5)
+    assert (difference.only_first, difference.only_other, difference.pairs, difference.mean) == (60, 0, 40, 0.0)
+    assert difference.success_p < 1e-9
+
+
 @pytest.mark.slow
 def test_p_values_are_corrected_for_the_number_of_algorithms() -> None:
     frame = make_paired_rows([1.0] * 12, [2.0] * 12)

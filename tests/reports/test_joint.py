@@ -15,6 +15,7 @@ from scipy import stats
 
 from marsyard.cli.outcome import evaluate_and_report
 from marsyard.cli.terminal import create_console
+from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
 from marsyard.reports.dashboard.entries import read_entries
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
@@ -128,6 +129,35 @@ def test_confirmation_until_decided_has_an_open_end() -> None:
     design = SamplingDesign(max_cases=1000).with_open_end
     assert (design.max_cases, design.first_look) == (None, 31)
     assert INDEPENDENT.with_open_end is INDEPENDENT
+
+
+def test_pass_needs_verified_rows(make_run: MakeRun) -> None:
+    frame = make_frame(np.random.default_rng(1), 60).assign(velocity_error_m_s=1.0)
+    directory = make_run(
+        frame, [REQUIREMENT, {**REQUIREMENT, "id": "RATE", "decide_by": "estimate", "accept_rate": True}]
+    )
+    assert evaluate_run(directory).exit_code == 0
+    (directory / "cases.sqlite").unlink()
+    evaluation = evaluate_run(directory)
+    assert (evaluation.overall_verdict.word, evaluation.exit_code) == ("PASS (unverified)", 4)
+    page = write_evaluation(evaluation)
+    report = json.loads((directory / "report.json").read_text())
+    assert (report["verdict"], report["exit_code"], report["verdicts"][0]["status"]) == (
+        "PASS (unverified)", 4, "PASS (unverified)"
+    )  # fmt: skip
+    assert "The rows are not verified" in page.read_text()
+    (entry,), _ = read_entries([directory], directory.parent / "pages")
+    assert entry.report.verdict == "PASS (unverified)"
+
+
+@pytest.mark.parametrize("cases", [[*range(46)], [0] * 60, [*range(1, 61)], [*range(59), 60]])
+def test_pass_needs_one_row_for_each_case(make_run: MakeRun, cases: list[int]) -> None:
+    """Removed, repeated and renumbered rows; without them 46 of 60 cases would be PASS."""
+    frame = make_frame(np.random.default_rng(1), 60).assign(velocity_error_m_s=1.0)
+    rows = frame.head(len(cases)).assign(case=cases)
+    evaluation = evaluate_run(make_run(rows, [REQUIREMENT], cases=60))
+    assert (evaluation.overall_verdict.word, evaluation.exit_code) == ("INSUFFICIENT", 3)
+    assert evaluation.overall_verdict.sentence.startswith("The rows are not those of 60 cases")
 
 
 @pytest.mark.parametrize("state", ["running", "interrupted", "shard"])

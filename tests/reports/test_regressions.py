@@ -122,6 +122,28 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
         assert find_changes(list_comparisons(history, next_night)) == []
 
 
+def test_metric_without_its_column_is_a_regression(tmp_path: Path) -> None:
+    """It is reported once: later nights are compared with nights that lack it, too."""
+    with History(tmp_path / "history.sqlite") as history:
+        for seed in range(2):
+            history.finish(_add_run(history, seed), FINISHED)
+        for expected in (["answered"], []):
+            night = history.begin("abc")
+            metrics = _draw_metrics(np.random.default_rng(9), _make_error_pool(4))
+            history.add(night, _make_campaign(), [metric for metric in metrics if metric.name != "answered"])
+            comparisons = list_comparisons(history, night)
+            changes = find_changes(comparisons)
+            assert [(change.metric, change.is_regression) for change in changes] == [(name, True) for name in expected]
+            history.finish(night, FINISHED, changes)
+            page = format_night_page(
+                history.nights()[0], history.nights()[1:], history.campaigns(night), changes, len(comparisons)
+            )
+            assert ("**first: answered**: its column is missing now" in page) == bool(expected)
+        other = history.begin("abc")
+        history.add(other, _make_campaign("another definition"), [])
+        assert list_comparisons(history, other) == []
+
+
 def test_failed_write_adds_no_metrics(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     with History(path) as history:

@@ -23,7 +23,7 @@ from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.verdicts import Status, Verdict
-from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows, write_table_with_seal
 
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 #: Text that would run a script or leave the folder of the site if it were not escaped.
@@ -70,6 +70,27 @@ def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path
     assert (entries[0].sites, entries[0].algorithms) == (("east", "west"), ("mine",))
     row = next(row for row in requirement_rows(entries, {}) if row.requirement == "DIMES-VEL")
     assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
+
+
+def test_confirmations_precede_later_explorations(make_run: MakeRun, tmp_path: Path) -> None:
+    """A FAIL of a confirmation is the headline also after explorations with PASS, which are marked everywhere."""
+    requirement = {**VELOCITY, "population": "all"}
+    confirmation = {"kind": "confirmation", "number": 1, "claim": "0f", "record": str(tmp_path / "none.jsonl")}
+    for day, (name, error, evidence) in enumerate([("old", 9.0, confirmation), ("b", 1.0, None), ("c", 1.0, None)]):
+        frame = make_rows(400, answer_rate=1.0, terrains=100_000).assign(velocity_error_m_s=error)[MIN_COLUMNS]
+        make_run(frame, [requirement], name=name, evidence=evidence, started_utc=f"2026-01-0{day + 1}T00:00:00Z")
+    site = tmp_path / "site"
+    write_site(site, [tmp_path / name for name in ("old", "b", "c")])
+    entries, _ = read_entries([tmp_path / name for name in ("old", "b", "c")], tmp_path / "pages")
+    (row,) = requirement_rows(entries, {})
+    assert [cell.word for cell in row.all_cells] == ["FAIL", "PASS (exploration)", "PASS (exploration)"]
+    assert (row.latest, row.trend) == (row.all_cells[0], None)
+    (row,) = requirement_rows(entries[:2], {})
+    assert (row.cells[0].word, row.trend is None) == ("PASS (exploration)", False)
+    matrix = list(csv.DictReader(io.StringIO((entries[1].folder / "verification.csv").read_text())))
+    assert [cells["verdict"] for cells in matrix] == ["PASS (exploration)"]
+    assert "<system-out>PASS (exploration). " in (entries[1].folder / "junit.xml").read_text()
+    assert '"PASS (exploration)"' in (site / "index.html").read_text()
 
 
 @pytest.mark.slow
@@ -216,7 +237,7 @@ def test_reports_of_others_are_written_again(
     write_report(directory)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     rows = directory / "cases.parquet"
-    make_rows(24, n_crashed=20)[MIN_COLUMNS].to_parquet(rows)
+    write_table_with_seal(directory, make_rows(24, n_crashed=20)[MIN_COLUMNS])
     os.utime(rows, (0, 0))
     _write_index(tmp_path)
     assert "20 cases crashed" in page.read_text(encoding="utf-8")
