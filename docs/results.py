@@ -232,16 +232,20 @@ def _format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def find_contradictions(text: str, reports: Mapping[str, Any], sources: Mapping[str, str]) -> Iterator[str]:
-    """Yield the sentences that name one stored campaign, with the numbers that are in neither report nor sources.
+    """Yield the sentences that name only one campaign, a stored one, with numbers that neither report nor sources have.
 
     A whole number agrees with an equal value of the report; a percentage, and a number with decimals, with a value that
     rounds to it. Generated tables and code blocks are left out. That a number agrees does not show that it is the right
     one of the report.
     """
     prose = re.sub(r"```.*?```|^ {4}.*?$", "", _BLOCK.sub("", text), flags=re.DOTALL | re.MULTILINE)
-    for sentence in re.split(r"(?<=[.:;])\s+(?=[A-Z`|])", " ".join(prose.split())):
-        names = [name for name in re.findall(r"`([a-z0-9-]+)`", sentence) if name in reports]
-        if len(set(names)) != 1:
+    campaigns = reports.keys() | catalogue().keys()
+    # headings and paragraphs end sentences
+    paragraphs = [" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", prose)]
+    sentences = [part for text in paragraphs for part in re.split(r"(?<=[.:;])\s+(?=[A-Z`|])", text)]
+    for sentence in sentences:
+        names = [name for name in re.findall(r"`([a-z0-9-]+)`", sentence) if name in campaigns]
+        if len(set(names)) != 1 or names[0] not in reports:
             continue
         values = [*_leaves(reports[names[0]])]
         known = {word.replace(",", "") for word in _NUMBER.findall(sources.get(names[0], ""))}
