@@ -4,7 +4,7 @@ import json
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +19,26 @@ from marsyard.reports.assurance.case import AssuranceCase, build_argument
 from marsyard.reports.assurance.package import ARGUMENT, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
+from marsyard.reports.validation_rows import VALIDATION_FILE, read_checks
 from tests.command import marsyard
 from tests.reports.assurance.stored_run import write_stored_run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _missed_check(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Replace the packaged checks by those with a missed one on descents over Gusev, whatever was measured."""
+    checks = json.loads(VALIDATION_FILE.read_text())
+    row = next(row for row in checks["flight"]["rows"] if row["claim"].endswith("descent over gusev, upper limit"))
+    row["limit"] = row["measured"] - 0.5 * abs(row["measured"])
+    path = tmp_path_factory.mktemp("checks") / "validation.json"
+    path.write_text(json.dumps(checks))
+    rows = [row for check in read_checks(path).values() for row in check.rows]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("marsyard.reports.assurance.package.VALIDATION_FILE", path)
+        patch.setattr(
+            "marsyard.reports.validity.rows_of_system", lambda system: [row for row in rows if row.concerns(system)]
+        )
+        yield
 
 
 @pytest.fixture(scope="module")
