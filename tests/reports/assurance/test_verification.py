@@ -26,7 +26,7 @@ from tests.reports.assurance.stored_run import write_stored_run
 
 @pytest.fixture(scope="module", autouse=True)
 def _missed_check(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Replace the packaged checks by those with a missed one on descents over Gusev, whatever was measured."""
+    """Replace the packaged checks by some with a missed one on descents over Gusev, for any measurements."""
     checks = json.loads(VALIDATION_FILE.read_text())
     row = next(row for row in checks["flight"]["rows"] if row["claim"].endswith("descent over gusev, upper limit"))
     row["limit"] = row["measured"] - 0.5 * abs(row["measured"])
