@@ -20,7 +20,8 @@ from marsyard.reports.wording import count, format_fraction, percent
 #: Confidence of the lower bound of the fraction of the cases that belong to a population; high, so that the stated
 #: number of cases is sufficient.
 _FRACTION_CONFIDENCE = 0.99
-#: Rate of failures, as a fraction of the permitted rate, above which the number of cases for PASS is not stated.
+#: Rate of failures, as a fraction of the permitted rate, above which the number of cases for PASS is not stated: it
+#: grows without limit as the fraction approaches 1.
 _NEAR_LIMIT = 0.95
 
 

@@ -91,6 +91,6 @@ class PositionEstimate:
 #: Stream that estimates a lander's position on a map. `start` receives the initial state and the map. All increments
 #: up to an image arrive before it. `process_image` returns the estimate at the time of the image, and `finish` that at
 #: the time of the last increment; an answer with another time is a BAD_ANSWER. An image whose time tag lies outside of
-#: the inertial data is refused with OUTSIDE_INERTIAL_DATA, at the time of the last increment; such an altitude is
+#: the inertial data is refused with OUTSIDE_INERTIAL_DATA, at the nearest time of these data; such an altitude is
 #: ignored.
 PositionEstimator = ImageStream[[InitialState, MapProduct], DetectorImage, PositionEstimate]

@@ -61,7 +61,7 @@ def event_scores(sizes: Sizes) -> Int[np.ndarray, " _"]:
     return np.asarray(-(-(events**2) * _MAX_SQUARED**2 // scale**2))
 
 
-#: Maximum cost of a bound, about 1 core-s: the largest value of its statistic, times the number of different numbers of
+#: Maximum cost of a bound, about 1 core-s: the largest value of its statistic, times the number of distinct numbers of
 #: cases on a terrain.
 _MAX_COST = 30_000
 

@@ -25,7 +25,8 @@ from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 
-#: Maximum error of a time tag in standard deviations: the filter runs until `TAIL_S` after the last image.
+#: Maximum error of a time tag in standard deviations, which 2e-9 of the tags exceed: the filter runs until `TAIL_S`
+#: after the last image.
 MAX_TAG_DEVIATIONS = 6.0
 
 

@@ -10,7 +10,8 @@ from marsyard.algorithms.localisation.interface import InitialState, MapProduct,
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
-#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.
+#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s. Answers
+#: of other programs contain times with a few decimals.
 _TIME_TOLERANCE_S = 1e-6
 
 
