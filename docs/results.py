@@ -42,7 +42,7 @@ HASHES, REPORT_HASHES = "rows.sha256", "sources.sha256"
 PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
 #: Sources that determine the rows of a run, and those that determine its report, as patterns of git.
 SOURCES, REPORT_SOURCES = (
-    ("sim", "algorithms", "scenarios", "campaigns"),
+    ("sim", "algorithms", "scenarios", "campaigns", ":(exclude)campaigns/studies"),
     ("reports", ":(exclude)reports/validation.json"),
 )
 _BLOCK = re.compile(

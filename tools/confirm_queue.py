@@ -4,8 +4,9 @@ A line of the list contains a campaign, its number of cases and of worker proces
 of confirmations is committed after each campaign. A repeated call skips complete campaigns, resumes interrupted ones,
 and repeats those without a folder with the seeds of their entry in the record. All campaigns run on one source tree:
 the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Pages, tests,
-tools and measurements are no part of the tree, because they determine neither rows nor verdicts. Exit code: 0 if all
-campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
+tools, measurements, studies and the command line do not determine the rows of a campaign, so they are no part of the
+tree; nor are the reports, which ``marsyard report`` writes again from the rows. Exit code: 0 if all campaigns are
+complete, with any verdict; 1 if one is not; 2 for invalid input.
 """
 
 import argparse
@@ -17,9 +18,10 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-#: Patterns of git for the files that determine neither rows nor verdicts.
+#: Patterns of git for the files that do not determine rows.
 _NO_SOURCES = tuple(
-    f":(exclude){path}" for path in ("*.md", "docs", "benchmarks", "tests", "tools", "reports/validation.json")
+    f":(exclude){path}"
+    for path in ("*.md", "docs", "benchmarks", "tests", "tools", "reports", "marsyard", "campaigns/studies")
 )
 
 

@@ -68,18 +68,19 @@ def test_changed_tree_is_refused(
     assert (tmp_path / RECORD).read_text() == ""
 
 
-def test_pages_and_measurements_are_no_part_of_the_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_do_not_determine_rows_are_no_part_of_the_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     create_project(tmp_path)
     monkeypatch.chdir(tmp_path)
     tree = queue.hash_tree(Path("confirmations.jsonl"), tmp_path / "no.log")
-    for name in ("README.md", "docs/results.py", "benchmarks/results/times.json", "reports/validation.json"):
+    for name in ("README.md", "docs/results.py", "benchmarks/results/times.json", "reports/verdict.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("1")
         git(tmp_path, "add", name)
         assert queue.hash_tree(Path("confirmations.jsonl"), tmp_path / "no.log") == tree, name
-    (tmp_path / "reports" / "verdict.py").write_text("1")
-    git(tmp_path, "add", "reports/verdict.py")
-    with pytest.raises(ValueError, match=r"the tree has changes \(A  reports/verdict.py\)"):
+    (tmp_path / "campaigns").mkdir()
+    (tmp_path / "campaigns" / "draws.py").write_text("1")
+    git(tmp_path, "add", "campaigns/draws.py")
+    with pytest.raises(ValueError, match=r"the tree has changes \(A  campaigns/draws.py\)"):
         queue.hash_tree(Path("confirmations.jsonl"), tmp_path / "no.log")
 
 
