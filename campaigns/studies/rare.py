@@ -126,7 +126,14 @@ class _RareStudy:
                 shortfall = f"The limit of cases was reached: {error}."
         decision = self._decide(results, violation_weights, shortfall)
         replicates_run = tuple(
-            Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
+            Replicate(
+                item.probability,
+                item.reached,
+                item.end.value,
+                item.thresholds,
+                tuple(level.probability for level in item.levels[1:]),
+            )
+            for item in results
         )
         return RareResult(
             verdict=decision.verdict,
