@@ -64,13 +64,14 @@ Blend = tuple[tuple[int, float], ...]
 #: newest component.
 MAX_BLENDED = 100_000
 
+
 class BlendedGenerator(np.random.Generator):
     """Random generator whose normal and uniform numbers are those of blended components.
 
     A component is the sequence of the standard normal numbers of a generator. The k-th normal number of the blend is
     the weighted sum of the k-th numbers of all components; with weights whose squares add up to 1, it is standard
     normal. A uniform number is the distribution function at the next normal number. Nothing else draws from the
-    components, so that a component has the same numbers in each blend, whatever other draws a case makes. All other
+    components, so that a component has the same numbers in each blend, for any other draws of a case. All other
     distributions, and draws of more than `MAX_BLENDED` values, have a stream of their own, that of the newest
     component.
     """

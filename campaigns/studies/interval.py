@@ -39,8 +39,9 @@ def replicate_interval(estimates: Sequence[float], confidence: float) -> Probabi
     """Compute the interval of a probability from independent estimates, at least two.
 
     Estimates of subset simulations are close to lognormal; their bias is small compared with the interval of a few
-    replicates (docs/rare-violations.md). The interval is Cox's for the mean of a lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m
-    and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))).
+    replicates (docs/rare-violations.md). The interval is Cox's for the mean of a lognormal distribution with Student's
+    t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m and variance v of n logarithms,
+    m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))).
     """
     values = np.array(estimates, dtype=np.float64)
     if values.size < 2:

@@ -211,8 +211,7 @@ class _RareStudy:
         blends = [blend for group in proposals for blend in group.blends]
         first = self._runner.n_cases
         points = [
-            StudyPoint(tuple(point.tolist()), blend=blend)
-            for point, blend in zip(coordinates, blends, strict=True)
+            StudyPoint(tuple(point.tolist()), blend=blend) for point, blend in zip(coordinates, blends, strict=True)
         ]
         rows = self._runner.run(points, self._reserved_cases)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])

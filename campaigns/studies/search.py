@@ -266,9 +266,9 @@ class SearchStudy:
     def _find_directions(self, paths: Sequence[str]) -> np.ndarray:
         """Find the directions in standard normal space on which the values of dispersions depend.
 
-        Returns orthonormal rows, as many as `paths`: the products with a point are independent standard normal numbers
-        that determine the values, whatever the other dispersions of correlated groups are. Their norm is the smallest
-        distance from the origin of a point with these values. Without correlation they are the coordinates of `paths`.
+        Returns orthonormal rows, as many as `paths`. Their products with a point are independent standard normal
+        numbers, which determine the values. The norm of these numbers is the smallest distance from the origin of a
+        point with the same values. Without correlation the numbers are the coordinates of `paths`.
         """
         drawn_paths = self.campaign.drawn_paths
         factor = np.eye(len(drawn_paths))

@@ -59,7 +59,7 @@ def test_sentences_state_verdict_bound_and_remedy(
 
 def test_figure_has_the_probabilities_of_the_levels() -> None:
     """Equal margins: a quarter of the cases reach the first level, not a tenth."""
-    replicate = Replicate(3e-7, True, SubsetEnd.VIOLATION.value, (5.0, 4.0), (0.25, 0.09))  # noqa: FBT003
+    replicate = Replicate(3e-7, True, SubsetEnd.VIOLATION.value, (5.0, 4.0), (0.25, 0.09))
     (line,) = rare._draw_levels([replicate], 1e-4).axes[0].get_lines()[:1]
     assert line.get_xydata().tolist() == [[5.0, 0.25], [4.0, 0.09], [0.0, 3e-7]]
 

@@ -108,7 +108,7 @@ def test_blended_numbers_change_continuously() -> None:
 
 
 def test_components_do_not_depend_on_the_other_draws_of_a_case() -> None:
-    """Integers and large draws are new in each step; the normal and uniform numbers after them are those of the case."""
+    """Integers and large draws are new in each step; the normal and uniform numbers after them are not."""
 
     def draw(blend: Blend, other_draws: int) -> list[float]:
         generator = Streams(5, "campaign", blend[-1][0], blend).generator("imu")
