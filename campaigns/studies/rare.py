@@ -7,7 +7,7 @@ Subset simulation (`studies.subset`; Au & Beck 2001) computes the probability as
 P(g < 0) = P(g <= b1) P(g <= b2 | g <= b1) ... P(g < 0 | g <= bm). Each threshold b is the quantile `LEVEL_FRACTION` of
 the margins of a level; Markov chains draw the next level from the cases below it. A simulation is a coroutine: it
 yields `Proposals`, receives their margins as `Evaluated`, and returns its estimate. This study runs several independent
-simulations (replicates) at once; their spread gives Cox's interval (`studies.interval`). Importance sampling
+simulations (replicates) at once; their spread gives the interval (`studies.interval`). Importance sampling
 (`studies.importance`; Melchers 1989) can refine the estimate with cases drawn around the violations that were found.
 
 A case is a point: a standard normal number per dispersion, and a blend, a weighted sum of numbered random streams that
