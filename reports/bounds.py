@@ -47,6 +47,7 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
         additional = proportions.additional_cases_needed(n, failures, verdict.probability, confidences[0])
     else:
         additional = pass_test.cases_needed(n, failures) - n
+        verdict = replace(verdict, first_look_n=first_n)
     return _add_binomial_bounds(verdict, n, (n - failures, n - failures), confidences, additional)
 
 

@@ -25,6 +25,10 @@ Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
 #: Kinds of cases that the record counts on each terrain: successes (0) and failures (1) of the population and other
 #: cases (2) of the first look, then the same kinds of later looks (3 to 5).
 _KINDS_PER_LOOK, _KINDS = 3, 6
+#: Order of the kinds on a terrain whose cases are restored from their counts. Other cases precede those of the
+#: population: the order of the cases is not recorded, so the first case of a terrain belongs to the population only if
+#: all of them do.
+_ORDER_OF_KINDS = np.array([2, 5, 0, 1, 3, 4])
 
 
 class _TerrainRow(NamedTuple):
@@ -97,10 +101,11 @@ class CaseEvidence:
         return np.arange(self.success.size) if self.groups is None else self.groups
 
     def join_own(self, own: CaseEvidence) -> CaseEvidence:
-        """Join the cases of earlier confirmations with those of the evaluated one, which are a later look."""
-        if self.contains_first:
-            own = replace(own, in_first_look=np.zeros(own.success.size, dtype=np.bool_))
-        return self.join(own)
+        """Join the cases of earlier confirmations with those of the evaluated one, which are a later look.
+
+        The cases of the evaluated one are restored from their counts, so that each confirmation has the same verdict.
+        """
+        return self.join(CaseEvidence.from_rows(own.to_rows(), is_first=not self.contains_first))
 
     def join(self, other: CaseEvidence) -> CaseEvidence:
         """Join with the cases of another confirmation."""
@@ -143,15 +148,19 @@ class CaseEvidence:
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]], *, is_first: bool) -> CaseEvidence:
-        """Create the results from the rows of `to_rows`; `is_first`: whether they are of the first confirmation."""
+        """Create the results from the rows of `to_rows`; `is_first`: whether they are of the first confirmation.
+
+        The cases of a terrain are in the order of `_ORDER_OF_KINDS`.
+        """
         terrain_rows = [_TerrainRow.from_list(row) for row in rows]
         names = tuple(row.label for row in terrain_rows if row.label is not None)
         # either all terrains have a name or none
         labels = names or None
         counts_by_terrain = [row.counts for row in terrain_rows for _ in range(row.repeats)]
         counts = np.array(counts_by_terrain, dtype=np.int64).reshape(-1, _KINDS)
-        kinds = np.repeat(np.tile(np.arange(_KINDS), len(counts)), counts.ravel())
-        groups = np.repeat(np.repeat(np.arange(len(counts)), _KINDS), counts.ravel())
+        cases = counts[:, _ORDER_OF_KINDS].ravel()
+        kinds = np.repeat(np.tile(_ORDER_OF_KINDS, len(counts)), cases)
+        groups = np.repeat(np.repeat(np.arange(len(counts)), _KINDS), cases)
         kind_of_look, in_first_look = kinds % _KINDS_PER_LOOK, (kinds < _KINDS_PER_LOOK) & is_first
         return cls(kind_of_look == 0, kind_of_look < 2, groups, in_first_look, labels, is_first)
 

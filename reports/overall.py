@@ -63,14 +63,16 @@ def find_remedy(verdicts: Sequence[Verdict], cases: int) -> Remedy:
 
 
 def _text_at_observed_rate(verdict: Verdict) -> str:
-    """State the cases that lead to PASS if failures continue at their rate so far; empty without a failure."""
+    """State the cases that lead to PASS if failures continue at their rate so far; empty if unknown, or without any."""
     if not verdict.failures or verdict.clustered is not None or verdict.decide_by == ESTIMATE:
+        return ""
+    if verdict.first_look_n is None:
         return ""
     rate, allowed = verdict.failures / verdict.n, 1.0 - verdict.probability
     text = f" If failures of {verdict.requirement_id} continue at their rate so far ({percent(rate)})"
     if rate > _NEAR_LIMIT * allowed:
         return f"{text}, more cases are not expected to lead to PASS: it permits {percent(allowed)}."
-    test = SequentialTest(allowed, 1.0 - verdict.confidence, verdict.n)
+    test = SequentialTest(allowed, 1.0 - verdict.confidence, verdict.first_look_n)
     return f"{text}, about {test.cases_needed(verdict.n, verdict.failures, rate) - verdict.n:,} more are needed."
 
 

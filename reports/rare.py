@@ -12,7 +12,6 @@ from marsyard.campaigns.studies.counting import CountingBound
 from marsyard.campaigns.studies.interval import ProbabilityInterval
 from marsyard.campaigns.studies.rare_decision import Basis, ContinuityCheck, Decision
 from marsyard.campaigns.studies.results import RARE, Replicate
-from marsyard.campaigns.studies.subset import LEVEL_FRACTION
 from marsyard.reports import figure_style, section
 from marsyard.reports.wording import count, format_fraction
 
@@ -115,7 +114,8 @@ def rare_section(subject: section.Subject) -> section.Section | None:
     ]
     grid = section.Grid(["Replicate", "Probability", "Levels", "End"], rows)
     note = (
-        "Each replicate is an independent subset simulation. A tenth of the cases of each level reaches the next one. "
+        "Each replicate is an independent subset simulation. A tenth of the cases of each level reaches the next one; "
+        "where many cases have the same margin, more or fewer do. "
         "The standard error within one replicate is too small, since its cases are correlated. "
         + (
             "The interval comes from the spread of the replicates."
@@ -155,11 +155,12 @@ def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Fig
     """
     figure, axes = figure_style.new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
-        margins = [value for value in replicate.thresholds if math.isfinite(value)]
-        # each level contains this fraction of the cases of the previous level
-        probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(margins))]
+        # records of earlier versions have no probabilities of levels
+        levels = zip(replicate.thresholds, replicate.level_probabilities, strict=False)
+        points = [(margin, probability) for margin, probability in levels if math.isfinite(margin)]
         if replicate.reached:
-            margins, probabilities = [*margins, 0.0], [*probabilities, replicate.probability]
+            points.append((0.0, replicate.probability))
+        margins, probabilities = [margin for margin, _ in points], [probability for _, probability in points]
         style: dict[str, Any] = {
             "color": figure_style.SERIES[index % len(figure_style.SERIES)],
             "marker": figure_style.MARKERS[index % len(figure_style.MARKERS)],

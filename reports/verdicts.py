@@ -84,6 +84,7 @@ class Verdict:
     - failures: cases with a missing, NaN or too large metric, unfinished cases, cases with a missing population flag
     - estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases; no bounds for other designs
     - additional_cases: those without failure for PASS, on new terrains if terrains are shared; None if unknown
+    - first_look_n: number of cases of the population at the first look; None if looks are planned
     - consumer_risk: probability of this result or a better one if the true rate equals the required rate
     - reason: why the requirement is not evaluated, or why the verdict is withheld
     - advice: why more cases cannot lead to PASS, and which change of the campaign can
@@ -113,6 +114,7 @@ class Verdict:
     lower: Number = math.nan
     upper: Number = math.nan
     additional_cases: int | None = None
+    first_look_n: int | None = None
     decide_by: str = "confidence"
     reason: str = ""
     terrains: int | None = None

@@ -8,6 +8,7 @@ several cases, so that the normal and uniform numbers change continuously with t
 """
 
 import hashlib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 
 @lru_cache(maxsize=1024)
@@ -62,31 +63,34 @@ Blend = tuple[tuple[int, float], ...]
 #: Maximum number of values of a draw that is blended. Larger draws, such as the noise of an image, are those of the
 #: newest component.
 MAX_BLENDED = 100_000
-#: Smallest distance of a uniform number from 0 and 1 before its transformation to a normal number.
-_MIN_TAIL = 1e-16
 
 
 class BlendedGenerator(np.random.Generator):
-    """Random generator whose normal numbers are weighted sums of those of several generators.
+    """Random generator whose normal and uniform numbers are those of blended components.
 
-    The sum of independent standard normal numbers with weights whose squares add up to 1 is a standard normal number.
-    Uniform numbers are transformed to normal numbers, summed, and transformed back. All other distributions, and draws
-    of more than `MAX_BLENDED` values, are those of the newest generator alone.
+    A component is the sequence of the standard normal numbers of a generator. The k-th normal number of the blend is
+    the weighted sum of the k-th numbers of all components; with weights whose squares add up to 1, it is standard
+    normal. A uniform number is the distribution function at the next normal number. Nothing else draws from the
+    components, so that a component has the same numbers in each blend, for any other draws of a case. All other
+    distributions, and draws of more than `MAX_BLENDED` values, have a stream of their own, that of the newest
+    component.
     """
 
     def __init__(self, components: Sequence[tuple[np.random.Generator, float]]) -> None:
-        *self._older, (newest, self._weight) = components
-        super().__init__(newest.bit_generator)
+        self._components = components
+        newest, _ = components[-1]
+        super().__init__(substream(newest, "draws that are not blended").bit_generator)
+
+    def spawn(self, n_children: int) -> list[np.random.Generator]:
+        """Create generators of other streams, which are not blended, as `numpy.random.Generator`."""
+        return np.random.Generator(self.bit_generator).spawn(n_children)
 
     def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Draw standard normal numbers as `numpy.random.Generator`."""
-        newest = super().standard_normal(size, dtype, out)
-        if out is not None or np.size(newest) > MAX_BLENDED:
-            return newest
-        total = self._weight * newest
-        for generator, weight in self._older:
-            total = total + weight * generator.standard_normal(size)
-        return total if np.ndim(total) == 0 else total.astype(dtype)
+        if out is not None or not _is_blended(size):
+            return super().standard_normal(size, dtype, out)
+        total = sum(weight * generator.standard_normal(size) for generator, weight in self._components)
+        return total if np.ndim(total) == 0 else np.asarray(total, dtype)
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         """Draw normal numbers as `numpy.random.Generator`."""
@@ -95,14 +99,11 @@ class BlendedGenerator(np.random.Generator):
 
     def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Draw uniform numbers from 0 to 1 as `numpy.random.Generator`."""
-        newest = super().random(size, dtype, out)
-        if out is not None or np.size(newest) > MAX_BLENDED:
-            return newest
-        total = self._weight * _to_normal(newest)
-        for generator, weight in self._older:
-            total = total + weight * _to_normal(generator.random(size))
-        uniform = np.minimum(ndtr(total), 1.0 - _MIN_TAIL)
-        return float(uniform) if np.ndim(uniform) == 0 else uniform.astype(dtype)
+        if out is not None or not _is_blended(size):
+            return super().random(size, dtype, out)
+        uniform = np.asarray(ndtr(self.standard_normal(size)), dtype)
+        below_1 = np.minimum(uniform, np.nextafter(uniform.dtype.type(1.0), uniform.dtype.type(0.0)))
+        return float(below_1) if np.ndim(below_1) == 0 else below_1
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
         """Draw uniform numbers from `low` to `high` as `numpy.random.Generator`."""
@@ -110,15 +111,16 @@ class BlendedGenerator(np.random.Generator):
         return low + (np.asarray(high) - low) * self.random(shape)
 
 
-def _to_normal(uniform: Any) -> Any:
-    return ndtri(np.clip(uniform, _MIN_TAIL, 1.0 - _MIN_TAIL))
+def _is_blended(size: Any) -> bool:
+    """Whether a draw of this size is blended."""
+    return size is None or math.prod(np.atleast_1d(size).tolist()) <= MAX_BLENDED
 
 
 @dataclass(frozen=True)
 class Streams:
     """Random streams of one case: root seed and name of the campaign, and number of the case, counted from zero.
 
-    blend: components of blended streams, of which `case` is the newest; empty for the streams of the case alone
+    blend: components of blended streams, of which `case` is the newest; empty for streams that are never blended
     """
 
     seed: int
@@ -128,7 +130,7 @@ class Streams:
 
     def generator(self, name: str) -> np.random.Generator:
         """Return a new generator at the start of the stream with this name."""
-        if len(self.blend) > 1:
+        if self.blend:
             return BlendedGenerator([(self._component(case, name), weight) for case, weight in self.blend])
         return self._component(self.case, name)
 

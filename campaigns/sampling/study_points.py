@@ -32,7 +32,7 @@ class StudyPoint:
     - stream: number of the random streams of the case (`marsyard.sim.streams`), or `NEW_STREAM`
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
-    - blend: components of blended random streams, of which `stream` is the newest; empty for one component
+    - blend: components of blended random streams, of which `stream` is the newest; empty for streams without blending
     - values: paths and values of parameters that replace those of the campaign
     """
 

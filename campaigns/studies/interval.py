@@ -38,39 +38,40 @@ def unknown_interval(confidence: float) -> ProbabilityInterval:
 def replicate_interval(estimates: Sequence[float], confidence: float) -> ProbabilityInterval:
     """Compute the interval of a probability from independent estimates, at least two.
 
-    Estimates of subset simulations are close to lognormal and unbiased. The interval is Cox's for the mean of a
-    lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m
-    and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))).
+    Estimates of subset simulations are close to lognormal. Their relative bias is the sum of the covariances of the
+    levels' relative errors (Au & Beck 2001), which is at most half of their relative variance. If it is not negative,
+    the probability is between the median and the mean of the estimates. With the mean m and variance v of n logarithms,
+    and Student's quantile t, the lower bound is that of the median, m - t sqrt(v / n), and the upper bound Cox's for
+    the mean, m + v / 2 + t sqrt(v / n + v^2 / (2 (n - 1))) (Olsson 2005, Journal of Statistics Education 13).
     """
     values = np.array(estimates, dtype=np.float64)
     if values.size < 2:
         raise ValueError(f"an interval needs at least 2 replicates, not {values.size}")
     logarithms = np.log(values)
-    variance = float(logarithms.var(ddof=1))
-    centre = float(logarithms.mean()) + 0.5 * variance
-    half_width = _log_half_width(variance, values.size, confidence)
-    lower, upper = math.exp(centre - half_width), min(math.exp(centre + half_width), 1.0)
+    centre, variance = float(logarithms.mean()), float(logarithms.var(ddof=1))
+    quantile = _student_quantile(confidence, values.size)
+    lower = math.exp(centre - quantile * math.sqrt(variance / values.size))
+    upper_error = quantile * math.sqrt(variance / values.size + variance**2 / (2.0 * (values.size - 1)))
+    upper = min(math.exp(centre + 0.5 * variance + upper_error), 1.0)
     return ProbabilityInterval(float(values.mean()), lower, upper, confidence, math.sqrt(variance))
 
 
-def _log_half_width(variance: float, replicates: int, confidence: float) -> float:
-    """Compute the half-width of Cox's interval, as a logarithm, from the variance of the logarithms of estimates."""
-    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), replicates - 1))
-    return quantile * math.sqrt(variance / replicates + variance**2 / (2.0 * (replicates - 1)))
+def _student_quantile(confidence: float, replicates: int) -> float:
+    return float(student_t.ppf(0.5 * (1.0 + confidence), replicates - 1))
 
 
 def additional_replicates(estimates: Sequence[float], confidence: float, max_probability: float) -> int | None:
-    """Estimate the number of additional replicates whose interval (`replicate_interval`) excludes the limit.
+    """Estimate the number of additional replicates whose interval (`replicate_interval`) is above the limit.
 
     - estimates: estimates of the present replicates, at least two; their spread is assumed to remain the same
     - confidence: two-sided confidence of the next interval
 
-    None if the estimate is so close to the limit that fewer than `_MAX_REPLICATES` do not decide.
+    None if the median is not so far above the limit that fewer than `_MAX_REPLICATES` decide.
     """
-    variance = float(np.log(estimates).var(ddof=1))
-    distance = abs(math.log(max_probability / float(np.mean(estimates))))
+    logarithms = np.log(estimates)
+    deviation, distance = float(logarithms.std(ddof=1)), float(logarithms.mean()) - math.log(max_probability)
     for count in range(len(estimates) + 1, _MAX_REPLICATES if distance > 0.0 else 0):
-        if _log_half_width(variance, count, confidence) <= distance:
+        if _student_quantile(confidence, count) * deviation / math.sqrt(count) <= distance:
             return count - len(estimates)
     return None
 

@@ -7,7 +7,7 @@ Subset simulation (`studies.subset`; Au & Beck 2001) computes the probability as
 P(g < 0) = P(g <= b1) P(g <= b2 | g <= b1) ... P(g < 0 | g <= bm). Each threshold b is the quantile `LEVEL_FRACTION` of
 the margins of a level; Markov chains draw the next level from the cases below it. A simulation is a coroutine: it
 yields `Proposals`, receives their margins as `Evaluated`, and returns its estimate. This study runs several independent
-simulations (replicates) at once; their spread gives Cox's interval (`studies.interval`). Importance sampling
+simulations (replicates) at once; their spread gives the interval (`studies.interval`). Importance sampling
 (`studies.importance`; Melchers 1989) can refine the estimate with cases drawn around the violations that were found.
 
 A case is a point: a standard normal number per dispersion, and a blend, a weighted sum of numbered random streams that
@@ -126,7 +126,14 @@ class _RareStudy:
                 shortfall = f"The limit of cases was reached: {error}."
         decision = self._decide(results, violation_weights, shortfall)
         replicates_run = tuple(
-            Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
+            Replicate(
+                item.probability,
+                item.reached,
+                item.end.value,
+                item.thresholds,
+                tuple(level.probability for level in item.levels[1:]),
+            )
+            for item in results
         )
         return RareResult(
             verdict=decision.verdict,
@@ -204,8 +211,7 @@ class _RareStudy:
         blends = [blend for group in proposals for blend in group.blends]
         first = self._runner.n_cases
         points = [
-            StudyPoint(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
-            for point, blend in zip(coordinates, blends, strict=True)
+            StudyPoint(tuple(point.tolist()), blend=blend) for point, blend in zip(coordinates, blends, strict=True)
         ]
         rows = self._runner.run(points, self._reserved_cases)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])

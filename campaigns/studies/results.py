@@ -54,12 +54,18 @@ class RareParameters:
 
 @dataclass(frozen=True)
 class Replicate:
-    """One subset simulation: estimated probability, whether it is an estimate, reason of its end, level thresholds."""
+    """One subset simulation.
+
+    - probability, reached: estimated probability of a violation, and whether it is an estimate
+    - end: reason why it ended
+    - thresholds, level_probabilities: margin and estimated probability of each intermediate level
+    """
 
     probability: float
     reached: bool
     end: str
     thresholds: tuple[Number, ...]
+    level_probabilities: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class _EvaluatedPoint:
 
 
 class _Cause(NamedTuple):
-    """Dispersions that remain in a reduced violation, and their standard normal coordinates."""
+    """Dispersions that remain in a reduced violation, and their independent coordinates (`_find_directions`)."""
 
     paths: list[str]
     coordinates: np.ndarray
@@ -205,9 +205,9 @@ class SearchStudy:
             first = remaining[0]
             reduction = self._shrink(self._remove_dispersions(first))
             paths = [path for path in self.campaign.drawn_paths if path not in reduction.point.nominal]
-            indices = [self.campaign.drawn_paths.index(path) for path in paths]
-            cause = _Cause(paths, np.array(reduction.point.coordinates)[indices])
-            coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
+            directions = self._find_directions(paths)
+            cause = _Cause(paths, directions @ np.array(reduction.point.coordinates))
+            coordinates = np.array([item.point.coordinates for item in remaining]) @ directions.T
             has_same_cause = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
             remaining = [item for item, is_similar in zip(remaining, has_same_cause, strict=True) if not is_similar]
             known = next((index for index, other in enumerate(causes) if cause.is_similar(other)), None)
@@ -263,21 +263,38 @@ class SearchStudy:
                 group_count = min(2 * group_count, len(paths))
         return failure
 
+    def _find_directions(self, paths: Sequence[str]) -> np.ndarray:
+        """Find the directions in standard normal space on which the values of dispersions depend.
+
+        Returns orthonormal rows, as many as `paths`. Their products with a point are independent standard normal
+        numbers, which determine the values. The norm of these numbers is the smallest distance from the origin of a
+        point with the same values. Without correlation the numbers are the coordinates of `paths`.
+        """
+        drawn_paths = self.campaign.drawn_paths
+        factor = np.eye(len(drawn_paths))
+        for group in self.campaign.definition.correlations:
+            members = [drawn_paths.index(path) for path in group.parameters]
+            factor[np.ix_(members, members)] = group.factor
+        rows = factor[[drawn_paths.index(path) for path in paths]]
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(rows @ rows.T), rows))
+
     def _shrink(self, failure: _EvaluatedPoint) -> _EvaluatedPoint:
         """Bisect each remaining coordinate towards its median, as long as the case remains a violation."""
-        for index, path in enumerate(self.campaign.drawn_paths):
-            if path in failure.point.nominal:
-                continue
-            inner, outer = 0.0, failure.point.coordinates[index]  # the median, and a violation
+        nominal = failure.point.nominal
+        directions = self._find_directions([path for path in self.campaign.drawn_paths if path not in nominal])
+        coordinates = directions @ np.array(failure.point.coordinates)
+        for index, start in enumerate(coordinates.tolist()):
+            inner, outer = 0.0, start  # the median, and a violation
             for _ in range(_BISECTION_STEPS):
                 middle = 0.5 * (inner + outer)
-                coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
-                (trial,) = self._evaluate([StudyPoint(tuple(coordinates), failure.point.stream, failure.point.nominal)])
+                point = tuple((coordinates @ directions).tolist())
+                (trial,) = self._evaluate([StudyPoint(point, failure.point.stream, nominal)])
                 if trial.margin < 0.0:
                     failure, outer = trial, middle
                 else:
                     inner = middle
+            coordinates[index] = outer
         return failure
 
 

@@ -98,6 +98,44 @@ def test_counts_in_the_record_keep_the_evidence(cases: list[tuple[bool, bool, in
     joined = evidence.join(restored)
     assert len(np.unique(joined.terrain_groups)) == len(names) * (1 if is_labelled else 2)
     assert not CaseEvidence.from_rows(rows, is_first=False).in_first_look.any()
+    # the terrains whose first case belongs to the population: the record cannot add one
+    terrains = [
+        {int(part.groups[first]) for first in np.unique(part.groups, return_index=True)[1] if part.member[first]}
+        for part in (evidence, restored)
+        if part.groups is not None
+    ]
+    assert len(terrains[1]) <= len(terrains[0])
+
+
+def test_all_confirmations_have_the_same_verdict_if_answers_depend_on_the_terrain() -> None:
+    """1 % of the terrains have only wrong answers, the others few answers: 9 % of the answers are wrong, not 3 %."""
+    requirement = {**REQUIREMENT, "population": "valid", "probability": 0.97}
+
+    def rows(terrains: int) -> pd.DataFrame:
+        terrain, case = np.divmod(np.arange(10 * terrains), 10)
+        is_wrong, has_answer = terrain % 100 == 99, case == 1 + terrain % 9
+        return pd.DataFrame(
+            {
+                "case": np.arange(10 * terrains),
+                "outcome": "VALID",
+                "answered": is_wrong | has_answer,
+                "terrain": terrain,
+                "velocity_error_m_s": np.where(is_wrong, 9.0, 1.0),
+            }
+        )
+
+    frames = [rows(40), rows(900), rows(50)]
+    parts = [collect_evidence(frame, requirement, INDEPENDENT, has_own_terrains=True) for frame in frames]
+    verdicts = []
+    for own, frame in enumerate(frames):
+        others = [
+            RequirementEvidence.from_table(part.to_table(), is_first=number == 0)
+            for number, part in enumerate(parts)
+            if part is not None and number != own
+        ]
+        verdicts += evaluate_requirements(frame, [requirement], earlier=[others[0].join(others[1])])
+    assert len({(verdict.status, verdict.lower, verdict.upper) for verdict in verdicts}) == 1
+    assert not verdicts[0].status.is_met
 
 
 def test_confirmations_share_terrains_also_if_a_case_has_none() -> None:

@@ -10,8 +10,9 @@ import pytest
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.rare_decision import RareSample, decide_rare
-from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult
+from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
+from marsyard.reports import rare
 from marsyard.reports.rare import rare_sentences
 
 
@@ -54,6 +55,13 @@ def test_sentences_state_verdict_bound_and_remedy(
         assert message in text
     assert ("marsyard append" in text) == (len(messages) > 1 or limit == 8e-5)
     assert ("--random" in text) == (len(messages) > 1)
+
+
+def test_figure_has_the_probabilities_of_the_levels() -> None:
+    """Equal margins: a quarter of the cases reach the first level, not a tenth."""
+    replicate = Replicate(3e-7, True, SubsetEnd.VIOLATION.value, (5.0, 4.0), (0.25, 0.09))
+    (line,) = rare._draw_levels([replicate], 1e-4).axes[0].get_lines()[:1]
+    assert line.get_xydata().tolist() == [[5.0, 0.25], [4.0, 0.09], [0.0, 3e-7]]
 
 
 @pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])

@@ -74,6 +74,16 @@ def test_remedy_states_whether_more_cases_help_at_the_observed_rate() -> None:
     assert texts[2].endswith("(6.00 %), more cases are not expected to lead to PASS: it permits 5.00 %.")
 
 
+def test_remedy_at_the_observed_rate_uses_the_first_look() -> None:
+    """Further cases with failures cannot be fewer than those without; planned looks have no number."""
+    frame = make_cases(300, 1).drop(columns="terrain").assign(case=np.arange(300))
+    (verdict,) = evaluate_requirements(frame, [VELOCITY], SamplingDesign(first_look=230))
+    assert verdict.additional_cases == 749
+    assert find_remedy([verdict], 300).text.endswith("about 2,204 more are needed.")
+    (planned,) = evaluate_requirements(frame, [VELOCITY], SamplingDesign(max_cases=1000))
+    assert "rate so far" not in find_remedy([planned], 300).text
+
+
 def test_populations_select_cases() -> None:
     frame = make_rows(100, answer_rate=0.8, n_crashed=3)
     n_answered, n_crashed = int(frame["answered"].sum()), 3

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, stream_words
-from marsyard.sim.streams import Streams, stream_key, substream
+from marsyard.sim.streams import Blend, Streams, stream_key, substream
 
 
 def _draw_first_numbers(streams: Streams, name: str) -> tuple[int, ...]:
@@ -103,10 +103,22 @@ def test_blended_numbers_change_continuously() -> None:
     for step in (0.01, 0.3):
         blended = _blended(step).standard_normal(20_000)
         assert np.corrcoef(older, blended)[0, 1] == pytest.approx(np.sqrt(1.0 - step**2), abs=0.02)
-    uniform = Streams(5, "campaign", 7).generator("dust").random(1000)
-    np.testing.assert_allclose(_blended(1e-9, "dust").random(1000), uniform, atol=1e-7)
-    newest = Streams(5, "campaign", 8).generator("detector").standard_normal((400, 400), dtype=np.float32)
+    newest = Streams(5, "campaign", 8, ((8, 1.0),)).generator("detector").standard_normal((400, 400), dtype=np.float32)
     np.testing.assert_array_equal(_blended(0.3, "detector").standard_normal((400, 400), dtype=np.float32), newest)
+
+
+def test_components_do_not_depend_on_the_other_draws_of_a_case() -> None:
+    """Integers and large draws are new in each step; the normal and uniform numbers after them are not."""
+
+    def draw(blend: Blend, other_draws: int) -> list[float]:
+        generator = Streams(5, "campaign", blend[-1][0], blend).generator("imu")
+        generator.integers(0, 10, other_draws)
+        generator.standard_normal(other_draws * 200_000)
+        return [generator.normal(), generator.random(), *generator.uniform(0.0, 1.0, 2)]
+
+    older = draw(((7, 1.0),), 3)
+    assert draw(((7, 1.0), (8, 0.0)), 1) == older
+    assert draw(((7, 1.0), (8, 0.0)), 0) == older
 
 
 def test_blended_numbers_have_the_shapes_of_numpy() -> None:
@@ -118,6 +130,7 @@ def test_blended_numbers_have_the_shapes_of_numpy() -> None:
     assert generator.uniform(np.zeros(4), 1.0).shape == (4,)
     assert generator.standard_normal((2, 2), dtype=np.float32).dtype == np.float32
     assert 0 <= int(generator.integers(10)) < 10
+    assert [child.random() for child in generator.spawn(2)] != [generator.random()] * 2
 
 
 def test_one_component_has_the_numbers_of_its_case() -> None:

@@ -1,11 +1,13 @@
 """Tests of the search for violations: a planted defect is found and reduced; continuation, files, report and errors."""
 
 import json
+import math
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from scipy.special import ndtri
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
@@ -88,6 +90,20 @@ def test_planted_defect_is_found_with_other_seeds(campaign_path: Path) -> None:
         runner = DirectRunner(campaign)
         study = SearchStudy(campaign, SearchParameters("VELOCITY"), runner)  # type: ignore[arg-type]  # no store
         assert_reduced_to_causes(study.run(RecordingWatch()))
+
+
+def test_reduced_violation_has_the_distance_of_its_values_also_in_a_correlated_group(tmp_path: Path) -> None:
+    """Sun elevation follows the dust, which is not a cause; the distance is that of the sun elevation itself."""
+    group = '[[correlations]]\nparameters = ["dust", "sun_deg"]\nrank = [[1.0, 0.95], [0.95, 1.0]]\n'
+    path = tmp_path / "campaign.toml"
+    path.write_text(CAMPAIGN.replace("[[requirements]]", f"{group}\n[[requirements]]"))
+    campaign = prepare_campaign(load_campaign(str(path)), 5000)
+    study = SearchStudy(campaign, SearchParameters("VELOCITY"), DirectRunner(campaign))  # type: ignore[arg-type]
+    result = study.run(RecordingWatch())
+    assert_reduced_to_causes(result)
+    failure = result.failures[0]
+    numbers = ndtri([(failure.values["sun_deg"] - 10.0) / 50.0, failure.values["yaw_deg"] / 360.0])
+    assert failure.distance == pytest.approx(math.hypot(*numbers))
 
 
 def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) -> None:
