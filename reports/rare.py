@@ -155,8 +155,7 @@ def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Fig
     """
     figure, axes = figure_style.new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
-        # records of earlier versions have no probabilities of levels
-        levels = zip(replicate.thresholds, replicate.level_probabilities, strict=False)
+        levels = zip(replicate.thresholds, replicate.level_probabilities, strict=True)
         points = [(margin, probability) for margin, probability in levels if math.isfinite(margin)]
         if replicate.reached:
             points.append((0.0, replicate.probability))

@@ -65,7 +65,7 @@ class Replicate:
     reached: bool
     end: str
     thresholds: tuple[Number, ...]
-    level_probabilities: tuple[float, ...] = ()
+    level_probabilities: tuple[float, ...]
 
 
 @dataclass(frozen=True)

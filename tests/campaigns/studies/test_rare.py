@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import CampaignError, DefinitionError
+from marsyard.campaigns.errors import CampaignError, DefinitionError, StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
@@ -140,7 +140,7 @@ def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_
 
 @pytest.mark.slow
 def test_finished_study_is_protected(finished_study: Path) -> None:
-    """Commands of campaigns, another program, and results without a counting bound, which an earlier version wrote."""
+    """Commands of campaigns, another program, and a result without its decision."""
     executor, watch = ExecutorConfig(1), RecordingWatch()
     for command in continuing_commands(finished_study, watch):
         with pytest.raises(CampaignError, match="contains a study"):
@@ -153,7 +153,8 @@ def test_finished_study_is_protected(finished_study: Path) -> None:
     assert evaluate_run(finished_study).exit_code == 0
     result = {name: value for name, value in stored["study"]["result"].items() if name != "decision"}
     record.update(finished_study, {"study": {**stored["study"], "result": result}})
-    assert evaluate_run(finished_study).exit_code == 3
+    with pytest.raises(StoreError):
+        evaluate_run(finished_study)
 
 
 @pytest.mark.parametrize(
