@@ -85,7 +85,7 @@ def estimate_driver(
 
 
 def explained_fraction(condition: Float[np.ndarray, " n"], response: Float[np.ndarray, " n"]) -> float:
-    """Estimate `Driver.fraction` of independent cases; 0 for fewer than four cases with both, or for constant values."""
+    """Estimate `Driver.fraction` of independent cases; 0 for fewer than four cases with both, or constant values."""
     finite = np.isfinite(condition) & np.isfinite(response)
     n = int(finite.sum())
     if n < _MIN_PAIRS or np.ptp(condition[finite]) == 0.0 or np.ptp(response[finite]) == 0.0:

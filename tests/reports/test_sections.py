@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign_report import write_report
-from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.column_selection import driver_columns
+from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.influences import drivers_section

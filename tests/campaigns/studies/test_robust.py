@@ -237,7 +237,10 @@ def test_factor_of_a_variant_scales_the_value_of_each_case(tmp_path: Path, dispe
 
 def test_values_that_the_scenario_rejects_in_a_case_are_found_before_the_first(tmp_path: Path) -> None:
     variant = SystemVariant(name="broken", title="half a terrain", factors={"terrain": 0.5}, source="test")
-    path, terrain = tmp_path / "campaign.toml", '[dispersions]\nterrain = { distribution = "integer", low = 0, high = 7 }'
+    path, terrain = (
+        tmp_path / "campaign.toml",
+        '[dispersions]\nterrain = { distribution = "integer", low = 0, high = 7 }',
+    )
     path.write_text(CAMPAIGN.replace("[dispersions]", terrain))
     run_campaign(load_campaign(str(path), (), 60), tmp_path / "run", ExecutorConfig(1), RecordingWatch())
     with pytest.raises(CampaignError, match=r"broken: .* \(case \d+\)"):
