@@ -209,6 +209,11 @@ def test_verdicts_of_variants(run: Path) -> None:
     assert weak.lower < norm.cdf(-0.3 * BETA) < weak.upper
     # with all cases, the bounds are those of the verdict
     assert 1.0 - verdicts["as assumed", "LOAD"].upper == pytest.approx(evaluation.verdicts[0].lower, abs=1e-6)
+    # the program changed during the run: nothing can be PASS
+    record.update(run, {"changes": [{"in": ["code"]}]})
+    statuses = {(item.variant, item.requirement): item.status for item in evaluate_run(run).variants}
+    assert statuses["as assumed", "LOAD"] is Status.INSUFFICIENT
+    assert statuses["weak", "LOAD"] is Status.FAIL
 
 
 @pytest.mark.parametrize(
