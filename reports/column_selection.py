@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.column_values import is_number, numbers
-from marsyard.reports.statistics.drivers import rank_correlation
+from marsyard.reports.statistics.drivers import explained_fraction
 from marsyard.scenarios.columns import split_unit
 
 _AXES = ("x", "y", "z")
@@ -47,10 +47,10 @@ def looks_like_condition(name: str) -> bool:
     return not _EXCLUDED_COLUMNS.search(name)
 
 
-def driver_columns(
-    frame: pd.DataFrame, metric: str, max_columns: int = 6, is_condition: Callable[[str], bool] = looks_like_condition
+def condition_columns(
+    frame: pd.DataFrame, metric: str, is_condition: Callable[[str], bool] = looks_like_condition
 ) -> list[str]:
-    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation.
+    """List the conditions that vary, without terrains, the metric and its components.
 
     A sampled value that a column of the scenario repeats is not listed again.
     """
@@ -62,12 +62,19 @@ def driver_columns(
         for name in names
         if name not in excluded_names and is_condition(name) and is_number(frame, name) and frame[name].nunique() > 1
     ]
-    candidates = distinct_columns(frame, candidates)
+    return distinct_columns(frame, candidates)
+
+
+def driver_columns(
+    frame: pd.DataFrame, metric: str, max_columns: int = 6, is_condition: Callable[[str], bool] = looks_like_condition
+) -> list[str]:
+    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by the explained variance."""
+    candidates = condition_columns(frame, metric, is_condition)
     preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
     magnitude = np.abs(numbers(frame, metric))
     others = sorted(
         (name for name in candidates if name not in preferred_names),
-        key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
+        key=lambda name: -explained_fraction(numbers(frame, name), magnitude),
     )
     return [*preferred_names, *others][:max_columns]
 

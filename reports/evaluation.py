@@ -82,8 +82,11 @@ class Evaluation:
 
     @cached_property
     def variants(self) -> tuple[VariantVerdict, ...]:
-        """Verdicts in the named variants that studies `robust` have run."""
-        return evaluate_variants(self._robust_studies, self.verdicts)
+        """Verdicts in the named variants that studies `robust` have run; none is PASS if that of the run cannot be."""
+        results = evaluate_variants(self._robust_studies, self.verdicts)
+        if not self.evidence.excludes_pass:
+            return results
+        return tuple(replace(item, status=Status.INSUFFICIENT) if item.status.is_met else item for item in results)
 
     @cached_property
     def _robust_studies(self) -> list[RobustStudy]:

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from marsyard.reports import populations, rates
-from marsyard.reports.column_selection import driver_columns
+from marsyard.reports.column_selection import condition_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
@@ -17,7 +17,7 @@ from marsyard.reports.statistics.difference_tests import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.wording import coefficient, format_fraction, label, note_text, p_text, percent
 
-#: Maximum number of ranked conditions, and of cases that are used for the ranking.
+#: Maximum number of conditions in a table, and of cases that are used for the ranking.
 _MAX_DRIVERS, _MAX_DRIVER_CASES = 12, 20_000
 
 
@@ -38,7 +38,7 @@ def drivers_section(subject: Subject) -> Section | None:
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~populations.success_mask(frame, metric, subject.bound)).astype(np.float64)
-    columns = driver_columns(frame, metric, _MAX_DRIVERS, subject.run.is_condition)
+    columns = condition_columns(frame, metric, subject.run.is_condition)
     ranked_drivers = {
         name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
     }
@@ -50,11 +50,11 @@ def drivers_section(subject: Subject) -> Section | None:
     blocks = []
     for name, drivers in ranked_drivers.items():
         rows = []
-        for column, driver, p_value in drivers:
+        for column, driver, p_value in drivers[:_MAX_DRIVERS]:
             ranks = [coefficient(driver.correlation), f"{coefficient(driver.lower)} to {coefficient(driver.upper)}"]
             fractions = [percent(driver.fraction), rates.range_text(driver.fraction_lower, driver.fraction_upper)]
             rows.append([label(column), f"{driver.n:,}", *ranks, *fractions, p_text(p_value)])
-        blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows)))
+        blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows, len(drivers) - len(rows))))
     data = {
         name: [{"condition": column, **asdict(driver), "corrected_p": p_value} for column, driver, p_value in drivers]
         for name, drivers in ranked_drivers.items()

@@ -78,6 +78,8 @@ def evaluate_robustness(
         case_numbers = frame["case"].to_numpy(dtype=np.int64)
         coordinates = draw_coordinates(campaign, case_numbers)
         for index, path in enumerate(campaign.drawn_paths):
+            if path.rpartition(".")[2] == "terrain":
+                continue  # the number of a terrain is a name, which has neither mean nor standard deviation
             quantity = DispersedQuantity.of(campaign, path, int(case_numbers[0]))
             for change in list_changes(quantity.dispersion, coordinates[:, index]):
                 if (sizes := quantity.sizes(change)) is not None:

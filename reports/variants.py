@@ -27,6 +27,7 @@ from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.reweighted_rates import ROUNDING, find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.reports.wording import count
 from marsyard.scenarios.columns import split_unit
 
 #: Number of evaluated values between the assumed and the farthest value of a parameter.
@@ -91,13 +92,19 @@ def read_robust_studies(run: StoredRun) -> list[RobustStudy]:
 
 
 def evaluate_variants(studies: Sequence[RobustStudy], verdicts: Sequence[Verdict]) -> tuple[VariantVerdict, ...]:
-    """Evaluate each requirement in each named variant, and in the campaign itself for the same cases."""
+    """Evaluate each requirement in each named variant, and in the campaign itself for the same cases.
+
+    Titles contain the number of cases if studies differ in it.
+    """
     results: list[VariantVerdict] = []
-    for study in studies:
-        named = [(variant, frame) for variant, frame in study.variants if not variant.parameter]
-        assumed = RobustVariant("as assumed", "the campaign's own values", {})
+    named_by_study = [[item for item in study.variants if not item[0].parameter] for study in studies]
+    sizes = [len(study.base) for study, named in zip(studies, named_by_study, strict=True) if named]
+    assumed = RobustVariant("as assumed", "the campaign's own values", {})
+    for study, named in zip(studies, named_by_study, strict=True):
         for variant, frame in [(assumed, study.base), *named] if named else ():
-            results += filter(None, (_evaluate(study, variant, frame, verdict) for verdict in verdicts))
+            title = f"{variant.title}, {count(len(frame), 'case')}" if len(set(sizes)) > 1 else variant.title
+            titled = replace(variant, title=title)
+            results += filter(None, (_evaluate(study, titled, frame, verdict) for verdict in verdicts))
     return tuple(results)
 
 

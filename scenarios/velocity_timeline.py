@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, UInt16
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.dimes import DimesDetails
@@ -26,6 +27,8 @@ from marsyard.sim.terrain import Surface
 
 #: Time between the poses of a path, s.
 STEP_S = 0.1
+#: Steps of the intersection of a ray with the ground; each reduces the error by a factor of at least two.
+_INTERSECTION_STEPS = 20
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -90,37 +93,46 @@ class VelocityCase:
         return Path(times, positions, self.motion.attitudes[later].as_quat())
 
     def _images(self, details: DimesDetails | None) -> list[TimedImage]:
-        columns, rows = self.images[0].shape[::-1]
         images = []
         for number, (state, counts) in enumerate(zip(self.states, self.images, strict=True)):
-            marks = {} if details is None else self._marks(details, number, (columns, rows))
+            marks = {} if details is None else self._marks(details, number)
             pose = CameraPose.from_camera(self.camera, state.world_from_body * self.mounting)
             images.append(TimedImage("descent camera", state.time_s, counts, self.bits, pose, marks))
         return images
 
-    def _marks(
-        self, details: DimesDetails, number: int, size: tuple[int, int]
-    ) -> dict[str, Float64[np.ndarray, "_ 2"]]:
+    def _marks(self, details: DimesDetails, number: int) -> dict[str, Float64[np.ndarray, "_ 2"]]:
         """Return the pixels of templates and matches in an image; those of DIMES are in binned images."""
         triple = self.triple or ()  # without a triple, DIMES has no tracks
         marks: dict[str, list[Float64[np.ndarray, "2"]]] = {"templates": [], "matches": [], "rejected": []}
         for track in details.tracks:
-            scale = np.array(size) / np.array(details.pairs[track.pair].views[0].size)
             for image, pixel, name in (
                 (triple[track.pair], track.template_pixel, "templates"),
                 (triple[track.pair + 1], track.match_pixel, "matches"),
             ):
                 if image == number:
-                    marks[name if track.valid else "rejected"].append((np.asarray(pixel) + 0.5) * scale - 0.5)
+                    marks[name if track.valid else "rejected"].append(self._image_pixel(details, track.pair, pixel))
         return {name: np.array(pixels).reshape(-1, 2) for name, pixels in marks.items()}
 
     def _track_points(self, details: DimesDetails) -> dict[str, TimedPoints]:
-        """Return the templates on the ground at the times of their images."""
+        """Return the points of the ground that the templates show, at the times of their images."""
         points = {}
         for is_valid, name in ((True, "valid templates"), (False, "rejected templates")):
             tracks = [track for track in details.tracks if track.valid == is_valid]
             states = [self.states[(self.triple or ())[track.pair]] for track in tracks]
-            horizontal = [state.position_m[:2] + track.ground_m for state, track in zip(states, tracks, strict=True)]
-            positions = np.array([[*point, float(self.surface.height(*point))] for point in horizontal]).reshape(-1, 3)
+            pixels = [self._image_pixel(details, track.pair, track.template_pixel) for track in tracks]
+            positions = np.array([*map(self._ground_point, states, pixels)]).reshape(-1, 3)
             points[name] = TimedPoints(np.array([state.time_s for state in states], dtype=np.float64), positions)
         return points
+
+    def _image_pixel(self, details: DimesDetails, pair: int, pixel: ArrayLike) -> Float64[np.ndarray, "2"]:
+        """Convert a pixel of the binned images of DIMES to the delivered images."""
+        scale = np.array(self.images[0].shape[::-1]) / np.array(details.pairs[pair].views[0].size)
+        return np.asarray((np.asarray(pixel) + 0.5) * scale - 0.5)
+
+    def _ground_point(self, state: State, pixel: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "3"]:
+        """Intersect the true ray of a pixel with the ground, whose slopes are less steep than the ray."""
+        pose, (origin, direction) = state.world_from_body * self.mounting, self.camera.rays(pixel)
+        point, ray = pose.apply(np.array(origin)), pose.rotation.apply(direction)
+        for _ in range(_INTERSECTION_STEPS):
+            point = point + ray * (float(self.surface.height(*point[:2])) - point[2]) / ray[2]
+        return np.asarray(point)

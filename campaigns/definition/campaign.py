@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel
@@ -91,20 +92,28 @@ class Campaign:
     def draws_at(self, point: StudyPoint) -> dict[str, Any]:
         """Compute the values of the dispersions at a point of a study. Raises ValueError like `draws`."""
         uniform = transform_to_uniform(point.coordinates, self.drawn_paths, self.definition.correlations)
-        return self._evaluate(uniform, point.stream, point.nominal)
+        return self._evaluate(uniform, point.stream, point.nominal, dict(point.values))
 
     def _evaluate(
-        self, probabilities: Mapping[str, float] | None, case: int, nominal: Sequence[str] = ()
+        self,
+        probabilities: Mapping[str, float] | None,
+        case: int,
+        nominal: Sequence[str] = (),
+        replaced: Mapping[str, Any] = MappingProxyType({}),
     ) -> dict[str, Any]:
         """Evaluate the dispersions at cumulative probabilities.
 
-        Dispersions in `nominal` have the value of the campaign's parameter; all of them if `probabilities` is None.
+        Dispersions in `replaced` have the value there, also fixed and derived ones. Those in `nominal` have the value
+        of the campaign's parameter; all of them if `probabilities` is None.
         Dispersions without a random number are evaluated at the probability 0.5, which does not affect their values.
         """
         parameters = self.definition.parameters
         values: dict[str, Any] = {}
         for path in self.order:
             dispersion = self.marginals[path]
+            if path in replaced:
+                values[path] = replaced[path]
+                continue
             is_nominal = probabilities is None or path in nominal
             if is_nominal and not isinstance(dispersion, Fixed | Derived):
                 values[path] = value_at(parameters, path)

@@ -14,7 +14,8 @@ from marsyard.sim.parameters import Parameters
 class SystemVariant(Parameters):
     """A named variant of the models of a system.
 
-    - values: values of parameters, by path; factors: factors of the campaign's values
+    - values: values of parameters, by path; factors: factors of the campaign's values, or of the sampled values of a
+      dispersed parameter
     - source: why this alternative is possible
     """
 
@@ -24,17 +25,23 @@ class SystemVariant(Parameters):
     factors: dict[str, float] = Field(default_factory=dict)
     source: str
 
-    def changes(self, campaign: Campaign) -> dict[str, Any]:
-        """Return the values by path; empty if the campaign has these values, or lacks one of the parameters."""
-        parameters = campaign.definition.parameters
+    def changes(self, campaign: Campaign) -> tuple[dict[str, Any], dict[str, float]]:
+        """Return the values by path, and the factors of dispersed parameters.
+
+        Both are empty if the campaign has these values, or lacks one of the parameters.
+        """
+        parameters, dispersed = campaign.definition.parameters, campaign.definition.dispersions
         try:
             own = {path: value_at(parameters, path) for path in (*self.values, *self.factors)}
         except ValueError:
-            return {}
+            return {}, {}
         if any(not isinstance(own[path], int | float) for path in self.factors):
-            return {}
-        values = self.values | {path: factor * own[path] for path, factor in self.factors.items()}
-        return {} if values == own else values
+            return {}, {}
+        factors = {path: factor for path, factor in self.factors.items() if path in dispersed}
+        scaled = {path: factor * own[path] for path, factor in self.factors.items() if path not in dispersed}
+        values = self.values | scaled
+        is_changed = factors or any(path in dispersed or value != own[path] for path, value in values.items())
+        return (values, factors) if is_changed else ({}, {})
 
 
 class _VariantsFile(Parameters):

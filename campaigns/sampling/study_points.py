@@ -33,7 +33,7 @@ class StudyPoint:
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
     - blend: components of blended random streams, of which `stream` is the newest; empty for streams without blending
-    - values: paths and values of parameters that replace those of the campaign
+    - values: paths and values of parameters that replace those of the campaign, also sampled ones
     """
 
     coordinates: tuple[float, ...]

@@ -1,7 +1,7 @@
 """Parameters and results of the four kinds of studies, which the record of a study contains (`study_record`)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from marsyard.campaigns.errors import CampaignError
@@ -246,13 +246,15 @@ BUDGET = StudyKind("budget", "an error budget (marsyard budget)", BudgetParamete
 class RobustVariant:
     """A variant of the cases of a run: values of parameters that replace those of the campaign, by path.
 
-    parameter: path of the parameter that is changed in steps; empty for a named variant
+    - parameter: path of the parameter that is changed in steps; empty for a named variant
+    - factors: factors of the sampled values of dispersed parameters, by path
     """
 
     name: str
     title: str
     values: dict[str, Any]
     parameter: str = ""
+    factors: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ study is stored in the folder `robust` of the run, whose report evaluates it (`m
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int
@@ -65,16 +65,22 @@ def start_robust(
     definition = record.stored_definition(run)
     campaign = _load_run(run, definition)
     steps = [step for path, value in farthest.items() for step in _list_steps(campaign, path, value)]
-    named = [RobustVariant(item.name, item.title, values) for item in variants if (values := item.changes(campaign))]
+    named = [
+        RobustVariant(item.name, item.title, values, factors=factors)
+        for item in variants
+        for values, factors in [item.changes(campaign)]
+        if values or factors
+    ]
     if not (steps or named):
-        raise CampaignError(f"{run}: there is nothing to change: all variants have the values of the campaign")
-    for variant in (*steps, *named):
-        _check_values(campaign, variant)
+        reason = "all variants have the values of the campaign, or change parameters that it lacks"
+        raise CampaignError(f"{run}: there is nothing to change: {reason}")
     rows = read_rows(run / TABLE_FILE)
     if definition.design.nominal:
         rows = rows[1:]  # the first case is no random draw
     chosen, weights = choose_cases(rows, definition.requirements, cases, _generator(definition))
     parameters = RobustParameters((*steps, *named), tuple(chosen.tolist()), tuple(weights.tolist()))
+    for variant in parameters.variants:
+        _check_values(campaign, variant, parameters.cases)
     session = StudySession(ROBUST, parameters, RobustCasesStudy, executor, observer)
     n_cases = len(parameters.variants) * len(parameters.cases)
     return start_study(campaign, n_cases, directory, session, streams=definition.total_cases)
@@ -143,17 +149,29 @@ def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVa
     return [RobustVariant(f"{path} = {value:g}", f"{path} = {value:g}", {path: value}, path) for value in typed]
 
 
-def _check_values(campaign: Campaign, variant: RobustVariant) -> None:
+def _check_values(campaign: Campaign, variant: RobustVariant, cases: Sequence[int]) -> None:
     """Raise CampaignError if the scenario rejects the values of a variant, or sampled tables would replace them."""
-    for path in variant.values:
+    for path in (*variant.values, *variant.factors):
         table = next((name for name in campaign.definition.dispersions if path.startswith(f"{name}.")), None)
         if table is not None:
             raise CampaignError(f"{variant.name}: its table '{table}' is dispersed as a whole")
-    try:
-        campaign.with_values(variant.values)
-    except (ValidationError, ValueError, KeyError) as error:
-        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        raise CampaignError(f"{variant.name}: {reason}") from error
+    for case in cases:
+        try:
+            point = _create_point(campaign, case, variant)
+            changed = campaign.at(point)
+            changed.with_values(changed.draws_at(point))
+        except (ValidationError, ValueError, KeyError, TypeError) as error:
+            reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+            raise CampaignError(f"{variant.name}: {reason} (case {case})") from error
+
+
+def _create_point(campaign: Campaign, case: int, variant: RobustVariant) -> StudyPoint:
+    """Create the point of a stored case with the values of a variant."""
+    uniform = campaign.draw_uniform(case)
+    point = StudyPoint(tuple(ndtri([uniform[path] for path in campaign.drawn_paths]).tolist()), case)
+    sampled = campaign.draws_at(point) if variant.factors else {}
+    values = variant.values | {path: factor * sampled[path] for path, factor in variant.factors.items()}
+    return replace(point, values=tuple(values.items()))
 
 
 def _generator(definition: CampaignDefinition) -> np.random.Generator:
@@ -172,13 +190,5 @@ class RobustCasesStudy:
         observer.begin("cases", len(variants) * len(cases))
         for first in range(0, len(cases), _BATCH):
             batch = cases[first : first + _BATCH]
-            self._runner.run([self._point(case, variant.values) for case in batch for variant in variants])
+            self._runner.run([_create_point(self._campaign, case, variant) for case in batch for variant in variants])
         return RobustResult(self._runner.n_cases)
-
-    def _point(self, case: int, values: Mapping[str, Any]) -> StudyPoint:
-        """Create the point of a stored case with the values of a variant."""
-        uniform = self._campaign.draw_uniform(case)
-        coordinates = tuple(ndtri([uniform[path] for path in self._campaign.drawn_paths]).tolist())
-        # a dispersed parameter would have its sampled value; as a nominal one it has the value of the variant
-        fixed = tuple(path for path in values if path in self._campaign.definition.dispersions)
-        return StudyPoint(coordinates, case, nominal=fixed, values=tuple(values.items()))

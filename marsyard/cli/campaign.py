@@ -77,7 +77,8 @@ def run(
     executor = make_executor(jobs, cluster)
     if dry_run:
         print_estimate(selected, executor)
-        print_limits(selected)
+        looks = {"max_cases": selected.definition.total_cases if until_decided else None}
+        print_limits(replace(selected, definition=selected.definition.model_copy(update=looks)))
         return
     directory = out if out is not None else default_directory(selected.definition.name)
     if shard is not None:

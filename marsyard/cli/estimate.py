@@ -1,14 +1,21 @@
 """Estimates printed before a campaign runs: time, disk space, and requirements that cannot be PASS."""
 
+import bisect
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
 import typer
 
 from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.execution.executors import ExecutorConfig, available_cores
 from marsyard.campaigns.running.estimate import estimate_campaign
 from marsyard.cli.terminal import size_text
-from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size
-from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.verdicts import ESTIMATE, Status
 from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of cases that are drawn to count their distinct terrains; the draws of a case take milliseconds.
@@ -28,8 +35,9 @@ def evidence_limits(campaign: Campaign) -> list[str]:
         return []
     if not design.independent:
         return [design.no_probability_reason]
-    strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
-    min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), definition.total_cases
+    needed = {item.id: _min_cases(item, design) for item in requirements}
+    strictest = max(requirements, key=lambda item: needed[item.id])
+    min_cases, cases = needed[strictest.id], definition.total_cases
     requirement_text = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
     limits = []
     if cases < min_cases:
@@ -47,6 +55,29 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     if terrains < min(cases, min_cases):
         limits.append(terrain_supply.advice(min_cases, strictest.probability, strictest.confidence))
     return limits
+
+
+def _min_cases(requirement: Requirement, design: SamplingDesign) -> int:
+    """Return the minimum number of cases, each on its own terrain, of which the verdict can be PASS.
+
+    It is that of a run without a failure under the rule of the verdict: with a nominal case, planned looks, or appended
+    cases.
+    """
+    rule = requirement.model_dump(mode="json") | {"population": "all"}
+    value = True if requirement.bound is None else 0.0
+
+    def can_pass(cases: int) -> bool:
+        numbers = np.arange(cases)
+        columns = {"case": numbers, "outcome": "VALID", "answered": True, "terrain": numbers}
+        rows = pd.DataFrame(columns | dict.fromkeys(requirement.metric_columns, value))
+        looks = design if design.max_cases is None else replace(design, max_cases=cases)
+        return evaluate_requirements(rows, [rule], looks)[0].status is Status.PASS
+
+    first = minimum_sample_size(requirement.probability, requirement.confidence)
+    upper = first
+    while not can_pass(upper):
+        upper *= 2
+    return first + bisect.bisect_left(range(first, upper), True, key=can_pass)
 
 
 def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:

@@ -209,6 +209,8 @@ def robust(
 
     run, farthest = directory, _read_farthest(parameter or [])
     available = {item.name: item for item in system_variants(stored_definition(run).scenario)}
+    if variant and not available:
+        raise CampaignError(f"--variant: the scenario '{stored_definition(run).scenario}' has no variants")
     for name in variant or ():
         if name not in available and name != "all":
             raise CampaignError(f"--variant: {unknown_name_message('variant', name, ['all', *available])}")

@@ -84,6 +84,30 @@ def estimate_driver(
     )
 
 
+def explained_fraction(condition: Float[np.ndarray, " n"], response: Float[np.ndarray, " n"]) -> float:
+    """Estimate `Driver.fraction` of independent cases; 0 for fewer than four cases with both, or constant values."""
+    finite = np.isfinite(condition) & np.isfinite(response)
+    n = int(finite.sum())
+    if n < _MIN_PAIRS or np.ptp(condition[finite]) == 0.0 or np.ptp(response[finite]) == 0.0:
+        return 0.0
+    bins, between, total = _sum_squares(stats.rankdata(condition[finite]), stats.rankdata(response[finite]))
+    return max(0.0, (between - (bins - 1.0) * (total - between) / (n - bins)) / total)
+
+
+def _sum_squares(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
+    """Divide the ranks x into bins; return their number, and the sums of squares of y between them and in all."""
+    max_bins = int(np.clip(x.size // _CASES_PER_BIN, 2, _MAX_BINS))
+    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
+    # intervals closed on the left, so that each value of a condition with two values has its own bin
+    bin_index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
+    if bin_index.max() == 0:
+        bin_index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
+    means = np.bincount(bin_index, weights=y) / np.bincount(bin_index)
+    total = float(((y - y.mean()) ** 2).sum())
+    between = float((np.bincount(bin_index) * (means - y.mean()) ** 2).sum())
+    return int(bin_index.max()) + 1, between, total
+
+
 class _ExplainedFraction(NamedTuple):
     """Fraction of a variance between bins, its interval, and the p-value of the F-test; see `Driver`."""
 
@@ -97,17 +121,7 @@ def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective_n: float, confidence: float
 ) -> _ExplainedFraction:
     """Estimate the fraction of the variance of the ranks y between bins of the ranks x."""
-    n = x.size
-    max_bins = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
-    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
-    # intervals closed on the left, so that each value of a condition with two values has its own bin
-    bin_index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-    if bin_index.max() == 0:
-        bin_index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
-    bins = int(bin_index.max()) + 1
-    means = np.bincount(bin_index, weights=y) / np.bincount(bin_index)
-    total = float(((y - y.mean()) ** 2).sum())
-    between = float((np.bincount(bin_index) * (means - y.mean()) ** 2).sum())
+    bins, between, total = _sum_squares(x, y)
     if between >= (1.0 - 1e-9) * total:
         return _ExplainedFraction(1.0, 1.0, 1.0, 0.0)
     within_degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins

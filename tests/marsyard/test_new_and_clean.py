@@ -3,18 +3,22 @@
 import json
 import shlex
 import tomllib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.sampling.design import Design
 from marsyard.cli.app import app
 from marsyard.cli.estimate import evidence_limits
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.statistics.sequential import SequentialTest
 from marsyard.reports.verdicts import Status
 from marsyard.scenarios.template import toml_environment
 from tests.command import run_command
@@ -111,6 +115,22 @@ def test_advice_about_terrains_can_be_followed_literally(name: str, overrides: l
     assert evidence_limits(campaign) == []
     path = "world.terrain" if name == "vtt-terrains" else "location.terrain"
     assert len({campaign.draws(case)[path] for case in range(int(options[-1]))}) == int(options[-1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "min_cases"),
+    [
+        ({}, 230),
+        ({"design": Design(nominal=True)}, 231),
+        ({"max_cases": 200}, 299),  # the last look has half of the risk: log(0.05) / log(0.99) = 298.1
+        ({"appended": (1,)}, SequentialTest(0.01, 0.1, 199).cases_needed(199, 0)),
+    ],
+)
+def test_minimum_number_of_cases_is_that_of_the_verdict(changes: dict[str, Any], min_cases: int) -> None:
+    """A nominal case is no evidence; looks before the last one, and after the first one, cost confidence."""
+    campaign = load_campaign("dimes-smoke", cases=199)
+    campaign = replace(campaign, definition=campaign.definition.model_copy(update=changes))
+    assert f"takes at least {min_cases} cases without a failure" in evidence_limits(campaign)[0]
 
 
 def test_designs_without_independent_draws_are_reported() -> None:

@@ -244,6 +244,13 @@ def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> No
     assert item.lower <= records["loads.0", ChangeKind.MEAN_UP].lower
 
 
+def test_number_of_a_terrain_is_not_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terrain = '[dispersions]\nterrain = {{ distribution = "integer", low = 0, high = 7 }}'
+    monkeypatch.setattr(f"{__name__}.CAMPAIGN", CAMPAIGN.replace("[dispersions]", terrain))
+    _, records, _ = evaluate(tmp_path, 300, 0.9, lambda first, second, kind: first > 2.5)
+    assert {parameter for parameter, _ in records} == {ALL_DISPERSIONS, "loads.0", "loads.1", "kindplain", "kindrough"}
+
+
 def test_few_cases_are_refused(tmp_path: Path) -> None:
     """Of 29 cases, nothing is said about any change, except about those of bounded divergence."""
     _, _, records = evaluate(tmp_path, 29, 0.9, lambda first, second, kind: first > 9.0)

@@ -9,9 +9,11 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign_report import write_report
+from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
+from marsyard.reports.influences import drivers_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
 from tests.reports.synthetic_run import MakeRun, make_rows
@@ -284,3 +286,23 @@ def test_page_and_json_contain_every_section(make_run: MakeRun) -> None:
     keys += ["sensitivity", "conditions"]
     assert list(report["sections"]) == keys
     assert all(f'<section id="{key}"' in text for key in keys)
+
+
+def test_true_cause_leads_the_drivers_of_errors_and_of_failures() -> None:
+    """Of 30 conditions, one signed error (without correlation) causes the errors, another one the missing answers."""
+    rng = np.random.default_rng(4)
+    conditions = rng.standard_normal((400, 30))
+    error = np.where(conditions[:, 29] > 1.0, np.nan, np.abs(3.0 * conditions[:, 28] + rng.standard_normal(400)))
+    frame = pd.DataFrame({f"tilt_{index}_deg": values for index, values in enumerate(conditions.T)})
+    frame = frame.assign(outcome="VALID", answered=np.isfinite(error), **{METRIC: error})
+    assert driver_columns(frame, METRIC)[0] == "tilt_28_deg"
+    section = drivers_section(make_subject(frame, bound=50.0))
+    assert section is not None
+    leaders = {name: drivers[0] for name, drivers in section.data.items()}
+    assert {name: driver["condition"] for name, driver in leaders.items()} == {
+        "the size of errors": "tilt_28_deg",
+        "failures": "tilt_29_deg",
+    }
+    # the p-values are corrected for all conditions, of which the tables show 12
+    assert [len(drivers) for drivers in section.data.values()] == [30, 30]
+    assert [len(block.grid.rows) for block in section.blocks if block.grid] == [12, 12]

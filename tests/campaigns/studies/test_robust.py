@@ -27,12 +27,13 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.results import RobustVariant
-from marsyard.campaigns.studies.robust import choose_cases, start_robust
+from marsyard.campaigns.studies.robust import _check_values, choose_cases, start_robust
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.robustness import ChangeOutcome
+from marsyard.reports.robustness_section import variant_grid
 from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
@@ -208,6 +209,61 @@ def test_verdicts_of_variants(run: Path) -> None:
     assert weak.lower < norm.cdf(-0.3 * BETA) < weak.upper
     # with all cases, the bounds are those of the verdict
     assert 1.0 - verdicts["as assumed", "LOAD"].upper == pytest.approx(evaluation.verdicts[0].lower, abs=1e-6)
+    # the program changed during the run: nothing can be PASS
+    record.update(run, {"changes": [{"in": ["code"]}]})
+    statuses = {(item.variant, item.requirement): item.status for item in evaluate_run(run).variants}
+    assert statuses["as assumed", "LOAD"] is Status.INSUFFICIENT
+    assert statuses["weak", "LOAD"] is Status.FAIL
+
+
+@pytest.mark.parametrize(
+    "dispersion",
+    [
+        '"fixed", value = 3.0',
+        '"derived", formula = "3.0 + 0.0 * noise"',
+        '"uniform", low = 2.0, high = 4.0',
+        '"choice", values = [2.0, 4.0]',
+    ],
+)
+def test_factor_of_a_variant_scales_the_value_of_each_case(tmp_path: Path, dispersion: str) -> None:
+    """Half of the value of `beta` in each case, however the campaign sets it; a value replaces it in all cases."""
+    path = tmp_path / "campaign.toml"
+    path.write_text(CAMPAIGN.replace("[dispersions]", f"[dispersions]\nbeta = {{ distribution = {dispersion} }}"))
+    run_campaign(load_campaign(str(path), (), 60), tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    factor = SystemVariant(name="half", title="half", factors={"beta": 0.5}, source="test")
+    value = SystemVariant(name="value", title="the campaign's parameter", values={"beta": 3.0}, source="test")
+    rows = read_case_rows(study(tmp_path / "run", {}, (factor, value), 60))
+    base = read_case_rows(tmp_path / "run")
+    for half, same, stored in zip(rows[::2], rows[1::2], base, strict=True):
+        assert half["beta"] == pytest.approx(0.5 * stored["beta"])
+        assert half["load"] == pytest.approx(stored["load"] + 0.5 * stored["beta"])
+        assert same["load"] == pytest.approx(stored["load"] + stored["beta"] - 3.0)
+
+
+def test_values_that_the_scenario_rejects_in_a_case_are_found_before_the_first(tmp_path: Path) -> None:
+    variant = SystemVariant(name="broken", title="half a terrain", factors={"terrain": 0.5}, source="test")
+    path, terrain = (
+        tmp_path / "campaign.toml",
+        '[dispersions]\nterrain = { distribution = "integer", low = 0, high = 7 }',
+    )
+    path.write_text(CAMPAIGN.replace("[dispersions]", terrain))
+    run_campaign(load_campaign(str(path), (), 60), tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    with pytest.raises(CampaignError, match=r"broken: .* \(case \d+\)"):
+        study(tmp_path / "run", {}, (variant,), 60)
+
+
+def test_each_study_has_its_own_row_as_assumed(run: Path) -> None:
+    """Variants are compared with the same cases under the campaign's values, also if studies have other cases."""
+    for name, cases, variant in (("a", 60, VARIANTS[0]), ("b", 200, VARIANTS[1])):
+        start_robust(run, {}, (variant,), cases, run / "robust" / name, ExecutorConfig(1), RecordingWatch())
+    grid, _ = variant_grid(evaluate_run(run).variants)
+    titles = [row[0] for row in grid.rows]
+    assert titles == [
+        "the campaign's own values, 60 cases",
+        "twice the noise, 60 cases",
+        "the campaign's own values, 200 cases",
+        "a lower limit, 200 cases",
+    ]
 
 
 def test_command_writes_report_and_table(run: Path) -> None:
@@ -280,8 +336,7 @@ def test_changed_rows_of_a_study_are_found(run: Path) -> None:
         (("--parameter", "step=1"), "is False; allowed: parameters with a number"),
         (("--parameter", f"beta={BETA}"), "this is its value in the campaign"),
         (("--parameter", "beta=1", "-n", "20"), "--cases 20: at least 60"),
-        (("--variant", "lambert"), "--variant: unknown variant 'lambert'"),
-        (("--variant", "all"), "there is nothing to change"),
+        (("--variant", "all"), "LimitStateScenario' has no variants"),
         *(
             (("--parameter", text), f"--parameter {text}: allowed: PATH=NUMBER")
             for text in ("beta", "beta=", "beta=two", "beta=nan")
@@ -329,8 +384,9 @@ def test_variants_of_the_included_systems_are_valid() -> None:
     for name in catalogue():
         campaign = load_campaign(name)
         for variant in system_variants(campaign.definition.scenario):
-            if changes := variant.changes(campaign):
-                campaign.with_values(changes)
+            values, factors = variant.changes(campaign)
+            if values or factors:
+                _check_values(campaign, RobustVariant(variant.name, variant.title, values, factors=factors), range(3))
                 kinds.setdefault(campaign.definition.scenario, set()).add(variant.name.partition("-")[0])
     for scenario in ("descent", "landing", "localisation", "rover"):
         assert {"photometry", "terrain"} <= kinds[scenario]
