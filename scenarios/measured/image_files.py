@@ -29,6 +29,8 @@ _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 p
 LOSSY_FORMATS = ("JPEG", "JPEG2000")
 _ALLOWED_PUBLISHED = "allowed: PNG, PGM, TIFF or JPEG with 8 or 16 bits"
 _COLOURS = 3
+#: Tag of the meaning of counts in a TIFF, and its value for negative images. OpenCV inverts those of 8 bits only.
+_PHOTOMETRIC, _WHITE_IS_ZERO = ExifTags.Base.PhotometricInterpretation, 0
 
 
 def read_header(path: Path) -> bytes:
@@ -104,6 +106,10 @@ def read_format(path: Path, size: tuple[int, int] | None = None, *, is_published
         except Image.DecompressionBombError as error:
             limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
             raise IngestError(f"{path}: has too many pixels; allowed: at most {limit}") from error
+        if image.format == "TIFF" and image.getexif().get(_PHOTOMETRIC) == _WHITE_IS_ZERO:
+            raise IngestError(
+                f"{path}: its counts are 0 for white (PhotometricInterpretation 0); allowed: 0 for black (1)"
+            )
         if image.format in LOSSY_FORMATS:
             image.load()  # OpenCV fills the missing part of a truncated file with grey
         orientation, (columns, rows) = image.getexif().get(ExifTags.Base.Orientation, 1), image.size

@@ -3,12 +3,15 @@
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import create_campaign, load_campaign
+from marsyard.campaigns.errors import DefinitionError
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.scenarios.conformance import inputs
 from tests.command import run_command
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
@@ -55,6 +58,43 @@ def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
     assert [campaign.parameters(case).case.name for case in range(2)] == ["one", "two"]  # type: ignore[attr-defined]
     # the identity of the campaign includes the hash of all images
     assert len(campaign.definition.parameters["cases"]["sha256"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cases": 4}, "4 cases repeat recorded cases, but the same images are no further evidence; allowed here: 2"),
+        (
+            {"dispersions": {"number": {"distribution": "choice", "values": [0, 1]}}},
+            "allowed: a grid of different numbers",
+        ),
+        (
+            {"dispersions": {"number": {"distribution": "grid", "values": [1, 1]}}},
+            "allowed: a grid of different numbers",
+        ),
+        ({"dispersions": {}}, "2 cases repeat recorded cases"),
+    ],
+)
+def test_recorded_cases_are_run_once(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    descent = inputs.descent()
+    folder = write_velocity_folder(tmp_path / "in", {"one": descent, "two": descent}, {})
+    assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
+    tables = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text())
+    with pytest.raises(DefinitionError, match=message):
+        create_campaign(tables | change, "test")
+    definition = {"scenario": "measured-velocity", "dispersions": change.get("dispersions", {})}
+    assert "recorded cases are not random draws" in read_sampling_design(definition).no_probability_reason
+
+
+def test_truth_that_is_an_input_is_reported(tmp_path: Path) -> None:
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    rows = read_rows(folder)
+    write_text_rows(folder, [{**row, "true_vx_m_s": row["vx_m_s"], "true_vy_m_s": row["vy_m_s"]} for row in rows])
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"))
+    assert status == 0
+    text = "The true velocity of 1 of 1 cases is also an input of the algorithms"
+    assert text in " ".join(output.split())
+    assert text in (tmp_path / "out" / "campaign.toml").read_text()
 
 
 def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:
