@@ -35,6 +35,27 @@ def find_campaign_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     return [*_check_sampling(campaign), *_check_metrics(campaign), *_check_calibration(campaign)]
 
 
+def find_repeated_cases(campaign: Campaign) -> list[tuple[Key, str]]:
+    """List problems of a campaign that would count a recorded case more than once, or as a random draw."""
+    if not isinstance(campaign.scenario, HasRecordedCases):
+        return []
+    path, total = campaign.scenario.recorded_case, campaign.definition.total_cases
+    dispersion, recorded = campaign.definition.dispersions.get(path), 1
+    if dispersion is not None:
+        points = dispersion.points if isinstance(dispersion, GridDispersion) else ()
+        # 1.0 is the number 1
+        recorded = len({f"{point:g}" if isinstance(point, float) else str(point) for point in points})
+        if recorded < max(len(points), 1):
+            message = "recorded cases are not random draws, and each is run once; allowed: a grid of different numbers"
+            return [(("dispersions", path), message)]
+    if total <= recorded:
+        return []
+    message = (
+        f"{total} cases repeat recorded cases, but the same images are no further evidence; allowed here: {recorded}"
+    )
+    return [(("cases",), message)]
+
+
 def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     """List problems of the campaign's dispersions: keys, and messages with the allowed values."""
     if campaign.definition.design.kind == ADAPTIVE:
@@ -44,7 +65,7 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     problems = [
         *campaign.definition.find_sampling_problems(),
         *_check_names(campaign),
-        *_check_recorded_cases(campaign),
+        *find_repeated_cases(campaign),
     ] or _check_ranges(campaign)
     if problems or not campaign.definition.dispersions:
         return problems
@@ -56,25 +77,6 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
         if error_text:
             return [(("dispersions",), f"the sampled values of case {case} are invalid in combination: {error_text}")]
     return []
-
-
-def _check_recorded_cases(campaign: Campaign) -> list[tuple[Key, str]]:
-    """List problems of a campaign that would count a recorded case more than once, or as a random draw."""
-    if not isinstance(campaign.scenario, HasRecordedCases):
-        return []
-    path, total = campaign.scenario.recorded_case, campaign.definition.total_cases
-    dispersion, recorded = campaign.definition.dispersions.get(path), 1
-    if dispersion is not None:
-        if not isinstance(dispersion, GridDispersion) or len(set(dispersion.points)) < len(dispersion.points):
-            message = "recorded cases are not random draws, and each is run once; allowed: a grid of different numbers"
-            return [(("dispersions", path), message)]
-        recorded = len(dispersion.points)
-    if total <= recorded:
-        return []
-    message = (
-        f"{total} cases repeat recorded cases, but the same images are no further evidence; allowed here: {recorded}"
-    )
-    return [(("cases",), message)]
 
 
 def _check_calibration(campaign: Campaign) -> list[tuple[Key, str]]:

@@ -35,6 +35,8 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     page = (run / "report.html").read_text()
     assert "Images compared with measured poses" in page
     assert 'aria-label="Images 1 and 2: ' in page
+    status, output = run_command("append", str(run), "1")
+    assert (status, "2 cases repeat recorded cases" in " ".join(output.split())) == (2, True)
     status, output = run_command("replay", str(run), "0", "--out", str(tmp_path / "again"))
     assert (status, "the row equals the stored one" in output) == (0, True)
     assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
@@ -82,6 +84,9 @@ def test_recorded_cases_are_run_once(tmp_path: Path, change: dict[str, Any], mes
     tables = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text())
     with pytest.raises(DefinitionError, match=message):
         create_campaign(tables | change, "test")
+    status, output = run_command("run", str(tmp_path / "out" / "campaign.toml"), "--confirm")
+    assert status == 2
+    assert "recorded cases are the same for every seed" in " ".join(output.split())
     definition = {"scenario": "measured-velocity", "dispersions": change.get("dispersions", {})}
     assert "recorded cases are not random draws" in read_sampling_design(definition).no_probability_reason
 
