@@ -1,7 +1,7 @@
 """Convert a folder of recorded images into stored cases and their campaign: `marsyard ingest`."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from marsyard.algorithms.dimes.views import binned_size_for
@@ -63,12 +63,8 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     description = stored_cases.description or _DESCRIPTIONS[stored_cases.task]
     if stored_cases.task == MAP:
         note = describe_poses(stored_cases)
-    elif known := _count_known_truths(stored_cases):
-        warning = (
-            f"The true velocity of {known} of {len(stored_cases.cases)} cases is also an input of the algorithms: "
-            "those that use this velocity, and not only its change as DIMES, have no error."
-        )
-        note, description = f"{note}\n{warning}".strip(), f"{description} {warning}"
+    warnings = "\n".join(_find_warnings(stored_cases))
+    note, description = f"{note}\n{warnings}".strip(), " ".join([description, *warnings.splitlines()])
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
     text = template.render(
         **stored_cases.model_dump(include={"folder", "name", "task"}),
@@ -85,14 +81,22 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     return Ingested(text, len(stored_cases.cases), sum(len(case.images) for case in stored_cases.cases), note)
 
 
-def _count_known_truths(stored_cases: store.StoredCases) -> int:
-    """Count the cases whose true velocity equals the mean velocity of the last interval, an input of algorithms."""
-    known = 0
-    for case in stored_cases.cases:
-        truth, intervals = case.truth.velocity_m_s, case.interval_velocities_m_s
-        if truth is not None and intervals is not None:
-            known += math.dist(truth, intervals[-1][:2]) < _EQUAL_M_S
-    return known
+def _find_warnings(stored_cases: store.StoredCases) -> Iterator[str]:
+    """Yield what limits the evidence of the cases, in one sentence each; it is also in the report."""
+    cases = stored_cases.cases
+    distinct = len({tuple(image.counts.sha256 for image in case.images) for case in cases})
+    if distinct < len(cases):
+        yield f"Only {distinct} of {len(cases)} cases have different images; rates count all cases."
+    known = sum(
+        math.dist(case.truth.velocity_m_s, case.interval_velocities_m_s[-1][:2]) < _EQUAL_M_S
+        for case in cases
+        if case.truth.velocity_m_s is not None and case.interval_velocities_m_s is not None
+    )
+    if known:
+        yield (
+            f"The true velocity of {known} of {len(cases)} cases is also an input of the algorithms: those that use "
+            "this velocity, and not only its change as DIMES, have no error."
+        )
 
 
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:

@@ -91,15 +91,16 @@ def test_recorded_cases_are_run_once(tmp_path: Path, change: dict[str, Any], mes
     assert "recorded cases are not random draws" in read_sampling_design(definition).no_probability_reason
 
 
-def test_truth_that_is_an_input_is_reported(tmp_path: Path) -> None:
-    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+def test_truth_that_is_an_input_and_repeated_images_are_reported(tmp_path: Path) -> None:
+    descent = inputs.descent()
+    folder = write_velocity_folder(tmp_path / "in", {"one": descent, "two": descent}, {})
     rows = read_rows(folder)
     write_text_rows(folder, [{**row, "true_vx_m_s": row["vx_m_s"], "true_vy_m_s": row["vy_m_s"]} for row in rows])
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"))
     assert status == 0
-    text = "The true velocity of 1 of 1 cases is also an input of the algorithms"
-    assert text in " ".join(output.split())
-    assert text in (tmp_path / "out" / "campaign.toml").read_text()
+    for text in ("The true velocity of 2 of 2 cases is also an input", "Only 1 of 2 cases have different images"):
+        assert text in " ".join(output.split())
+        assert text in (tmp_path / "out" / "campaign.toml").read_text()
 
 
 def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:
