@@ -230,6 +230,9 @@ class FolderReader:
             flat_field, shape = self.flat_fields[path]
             if shape != counts.shape:
                 raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels, unlike {row.texts['file']}")
+        detector, exposure_s = self.file.detector, row.numbers.get("exposure_s", self.file.detector.exposure_s)
+        if exposure_s == 0.0 and detector.transfer_row_s + detector.clear_row_s > 0.0:
+            raise row.error("exposure_s is 0 or empty; a frame transfer (transfer_row_s, clear_row_s) needs it")
         return store.StoredImage(
             source=row.texts["file"],
             size=camera.size,
@@ -237,7 +240,7 @@ class FolderReader:
             camera=self.cameras[camera],
             flat_field=flat_field,
             time_s=image.time_s,
-            exposure_s=row.numbers.get("exposure_s", self.file.detector.exposure_s),
+            exposure_s=exposure_s,
             world_from_body_xyzw=None if posed.attitude is None else _to_quaternion(posed.attitude),
             position_m=None if posed.position_m is None else _to_vector(posed.position_m),
             altitude_m=row.numbers.get("altitude_m"),

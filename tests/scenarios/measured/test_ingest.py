@@ -73,6 +73,10 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
             ],
             "line 3: a true velocity or position is given, but none for the last two images",
         ),
+        (
+            lambda rows: [{**row, "exposure_s": "0"} for row in rows],
+            "line 2: exposure_s is 0 or empty; a frame transfer",
+        ),
         (lambda rows: change_cells(rows, 2, file="drop-1.png"), "line 4: drop-1.png is also the image of line 3"),
     ],
 )
