@@ -15,6 +15,8 @@ from marsyard.campaigns.sampling.dispersions import list_sequences
 from marsyard.reports.statistics.sequential import planned_looks, risk_fraction_at
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction
+from marsyard.scenarios.interface import HasRecordedCases
+from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_names
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class SamplingDesign:
     - design: `random`, `latin-hypercube` or `sobol`
     - grids: paths of the parameters that were swept as a grid
     - sequences: paths of the parameters, other than terrains, whose values were used in turn
+    - recorded: whether the cases are recorded, and not drawn
     - nominal: whether case 0 is the nominal case, with nominal parameters instead of sampled ones
     - max_cases: number of cases at the last look (planned evaluation) of a sequential campaign; otherwise None
     - first_look: number of cases at the first verdict if cases were appended after it; otherwise None
@@ -98,11 +101,12 @@ class SamplingDesign:
     first_look: int | None = None
     terrains: TerrainSupply | None = None
     sequences: tuple[str, ...] = ()
+    recorded: bool = False
 
     @property
     def independent(self) -> bool:
         """Whether the cases, except the nominal one, are independent random samples."""
-        return self.design == RANDOM and not self.grids and not self.sequences
+        return self.design == RANDOM and not self.grids and not self.sequences and not self.recorded
 
     @property
     def text(self) -> str:
@@ -114,6 +118,8 @@ class SamplingDesign:
         """Explanation why the cases allow no probability statement; empty for independent random samples."""
         if self.independent:
             return ""
+        if self.recorded:
+            return "No probability statement: recorded cases are not random draws."
         steps = [] if self.design == RANDOM else ['set design.kind = "random"']
         paths = (*self.grids, *self.sequences)
         remedy = " and ".join([*steps, *(f"define a random distribution for '{path}'" for path in paths)])
@@ -171,4 +177,13 @@ def read_sampling_design(definition: Mapping[str, Any]) -> SamplingDesign:
         first_look if isinstance(first_look, int) else None,
         read_terrain_supply(definition),
         list_sequences(dispersions),
+        _has_recorded_cases(definition.get("scenario")),
     )
+
+
+def _has_recorded_cases(name: object) -> bool:
+    """Return whether a scenario has recorded cases; False for the name of an unknown scenario."""
+    try:
+        return name in scenario_names() and isinstance(scenario(str(name)), HasRecordedCases)
+    except UnknownScenarioError:
+        return False

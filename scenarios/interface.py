@@ -91,6 +91,15 @@ class IdentifiesTerrains(Protocol):
 
 
 @runtime_checkable
+class HasRecordedCases(Protocol):
+    """A scenario with recorded cases, which are not random draws: a campaign runs each of them once."""
+
+    @property
+    def recorded_case(self) -> str:
+        """Path of the parameter that selects the recorded case."""
+
+
+@runtime_checkable
 class HasAlgorithms(Protocol):
     """A scenario whose algorithms are selected in the campaign file.
 

@@ -41,6 +41,8 @@ _MIN_SIDE = 4
 HEIGHTS_M = (-11_500.0, 22_000.0)
 #: Names of the unit metre in a GeoTIFF; without a name, heights are assumed to be in metres.
 _METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
+#: Vertical axis of depths in a projection's text (WKT 1).
+_DEPTH_AXIS = ",DOWN]"
 _NO_GEOTIFF = "is not a valid GeoTIFF"
 #: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
@@ -172,6 +174,8 @@ def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
         yield "contains 8-bit values, as in an image; allowed: heights in metres"
     if (file.units[0] or "").strip().lower() not in _METRE_UNITS:
         yield f"its heights are in {file.units[0]!r}; allowed: metres (rio calc)"
+    if _DEPTH_AXIS in crs.to_wkt():
+        yield "contains depths (its vertical axis points down); allowed: heights, positive upwards (rio calc)"
     if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
         yield f"has scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
 

@@ -18,7 +18,7 @@ from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersio
 from marsyard.scenarios.algorithm_labels import labels
 from marsyard.scenarios.columns import ENGINE, Column, ColumnKind, Columns, flag
 from marsyard.scenarios.declared_columns import row_columns
-from marsyard.scenarios.interface import HasParts
+from marsyard.scenarios.interface import HasParts, HasRecordedCases
 from marsyard.scenarios.parts.named import SCORE
 
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
@@ -35,13 +35,38 @@ def find_campaign_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     return [*_check_sampling(campaign), *_check_metrics(campaign), *_check_calibration(campaign)]
 
 
+def find_repeated_cases(campaign: Campaign) -> list[tuple[Key, str]]:
+    """List problems of a campaign that would count a recorded case more than once, or as a random draw."""
+    if not isinstance(campaign.scenario, HasRecordedCases):
+        return []
+    path, total = campaign.scenario.recorded_case, campaign.definition.total_cases
+    dispersion, recorded = campaign.definition.dispersions.get(path), 1
+    if dispersion is not None:
+        points = dispersion.points if isinstance(dispersion, GridDispersion) else ()
+        # 1.0 is the number 1
+        recorded = len({f"{point:g}" if isinstance(point, float) else str(point) for point in points})
+        if recorded < max(len(points), 1):
+            message = "recorded cases are not random draws, and each is run once; allowed: a grid of different numbers"
+            return [(("dispersions", path), message)]
+    if total <= recorded:
+        return []
+    message = (
+        f"{total} cases repeat recorded cases, but the same images are no further evidence; allowed here: {recorded}"
+    )
+    return [(("cases",), message)]
+
+
 def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     """List problems of the campaign's dispersions: keys, and messages with the allowed values."""
     if campaign.definition.design.kind == ADAPTIVE:
         return [
             (("design", "kind"), "adaptive is for studies (marsyard rare); allowed: random, latin-hypercube, sobol")
         ]
-    problems = [*campaign.definition.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
+    problems = [
+        *campaign.definition.find_sampling_problems(),
+        *_check_names(campaign),
+        *find_repeated_cases(campaign),
+    ] or _check_ranges(campaign)
     if problems or not campaign.definition.dispersions:
         return problems
     for case in range(min(campaign.definition.cases, _CHECKED_CASES)):

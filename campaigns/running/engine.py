@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, CaseLimits
-from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
+from marsyard.campaigns.definition.checks import NUMBERS, find_repeated_cases, find_unknown_columns
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity
 from marsyard.campaigns.definition.toml_models import key_text
@@ -146,7 +146,10 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     problems = [message for _, message in extended_definition.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
-    return load_stored_campaign(directory, extended_definition)
+    campaign = load_stored_campaign(directory, extended_definition)
+    for _, message in find_repeated_cases(campaign):
+        raise CampaignError(f"{cases} cases cannot be added to {directory}: {message}")
+    return campaign
 
 
 def _reject_study(directory: Path, definition: CampaignDefinition) -> None:

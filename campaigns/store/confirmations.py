@@ -38,7 +38,7 @@ from marsyard.campaigns.store.git_history import (
     is_catalogue_file,
 )
 from marsyard.campaigns.store.record import utc_now
-from marsyard.scenarios.interface import HasAlgorithms
+from marsyard.scenarios.interface import HasAlgorithms, HasRecordedCases
 
 
 def classify_run(campaign: Campaign) -> Evidence:
@@ -79,8 +79,13 @@ def _derive_seeds(campaign: Campaign, claim: str, record: ConfirmationRecord) ->
 def select_confirmation_seed(campaign: Campaign) -> Campaign:
     """Return the campaign with the seeds of its next confirmation.
 
-    Raises StoreError if the record is invalid, and CampaignError if custom algorithms would run inside of the workers.
+    Raises StoreError if the record is invalid, and CampaignError if custom algorithms would run inside of the workers,
+    or if the cases are recorded.
     """
+    if isinstance(campaign.scenario, HasRecordedCases):
+        raise CampaignError(
+            "recorded cases are the same for every seed, and were seen by the first run; allowed: without --confirm"
+        )
     table = campaign.scenario.algorithm_table if isinstance(campaign.scenario, HasAlgorithms) else ()
     if find_value(campaign.definition.parameters, ".".join((*table, "executable", "isolated"))) is False:
         raise CampaignError(

@@ -1,7 +1,7 @@
 """Presentation of measured cases (real images): agreement with measured poses, and views of cases."""
 
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, isinf, isnan, nan
 from typing import Any
 
 import numpy as np
@@ -115,6 +115,8 @@ _COLUMNS = (
     "inertial_difference_m_s", "pair_discrepancy_m_s", "rotation_pose_difference_deg", "direction_pose_difference_deg",
     "baseline_pose_difference_fraction",
 )  # fmt: skip
+#: Infinite residual: by the poses, the later image does not show what both images show.
+_OUT_OF_VIEW = "out of view"
 _INERTIAL_NOTE = (
     "Differences from the inertial velocity contain its constant error. The discrepancy of pairs does not: it compares "
     "the change of velocity from the first pair of images to the second with the inertial change. Without measured "
@@ -130,14 +132,20 @@ def agreement_section(subject: section.Subject) -> section.Section | None:
         return None
     # differences of compared algorithms come last
     differences = [str(name) for name in frame if str(name).endswith((".difference_m_s", ".difference_m"))]
-    names = [name for name in (*_COLUMNS, *differences) if name in frame and np.isfinite(numbers(frame, name)).any()]
+    names = [name for name in (*_COLUMNS, *differences) if name in frame and not np.isnan(numbers(frame, name)).all()]
     medians = numbers(frame, MEDIAN)
     head = ["Case", "Name", "Outcome", *(label(name) for name in names)]
     rows = []
     for index, row in enumerate(frame.head(_MAX_ROWS).to_dict("records")):
         values = [float(numbers(frame, name)[index]) for name in names]
         texts = [
-            NOTHING if not isfinite(value) else f"{value:.0f}" if value.is_integer() else number(value)
+            _OUT_OF_VIEW
+            if isinf(value)
+            else NOTHING
+            if isnan(value)
+            else f"{value:.0f}"
+            if value.is_integer()
+            else number(value)
             for value in values
         ]
         rows.append([str(row.get("case", index)), str(row["measured_case"]), str(row["outcome"]), *texts])
@@ -150,10 +158,12 @@ def agreement_section(subject: section.Subject) -> section.Section | None:
         )
     note = (_INERTIAL_NOTE if "inertial_difference_m_s" in names else "") + _SAMPLING_NOTE
     grid = section.Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
+    median = float(np.nanmedian(medians)) if not np.isnan(medians).all() else nan
     data = {
         "cases": len(frame),
-        "unmatched": int(np.count_nonzero(~np.isfinite(medians))),
-        "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
+        "unmatched": int(np.count_nonzero(np.isnan(medians))),
+        "out_of_view": int(np.count_nonzero(np.isinf(medians))),
+        "median_of_medians_px": median if isfinite(median) else None,
         "differences": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
     }
     blocks = [section.Block(text=note_text("measured.agreement_text"), figures=svg_figures, grid=grid, note=note)]

@@ -18,6 +18,9 @@ from marsyard.sim.parameters import bounded_field
 
 #: Required duration of the flight after the last image, and tolerance of its start for rounding, s.
 END_MARGIN_S, _ROUNDING_S = 0.5, 1e-9
+#: Maximum time between two poses while the instruments measure (assumed): a lander on a parachute swings in a few
+#: seconds, so that splines over longer gaps invent its motion. Times in another unit than seconds also exceed it.
+MAX_GAP_S = 2.0
 
 
 class FlightOrigin(Enum):
@@ -64,7 +67,10 @@ class FlightFile(UserFile, RecordedAxes):
         return read_poses(self.file).start_s + Decimal(repr(self.lead_s))
 
     def check(self, image_times_s: Sequence[float]) -> None:
-        """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
+        """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground.
+
+        The poses from the start of navigation to the last image must not be more than `MAX_GAP_S` apart.
+        """
         trajectory = self.create_trajectory(np.zeros(3), 0.0)
         first, last = trajectory.span_s
         if first > -self.lead_s + _ROUNDING_S or last < max(image_times_s) + END_MARGIN_S:
@@ -75,6 +81,14 @@ class FlightFile(UserFile, RecordedAxes):
                 f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from "
                 f"{self.first_image_time_s:.3f} to {last_image_time_s:.3f} s, lead_s {self.lead_s:g} s before and "
                 f"{END_MARGIN_S:g} s after them are needed"
+            )
+        times, gaps = trajectory.times_s, np.diff(trajectory.times_s)
+        gaps[(times[1:] <= -self.lead_s) | (times[:-1] >= max(image_times_s) + END_MARGIN_S)] = 0.0
+        if gaps.max() > MAX_GAP_S:
+            raise TrajectoryFileError(
+                f"{self.file}: pose {gaps.argmax() + 2} is {gaps.max():.6g} s after the pose before it; allowed from "
+                f"the start of navigation to the last image: up to {MAX_GAP_S:g} s (times are in seconds, integers in "
+                "a column time_ns in nanoseconds)"
             )
         check_looks_down(self.file, trajectory, image_times_s)
         for number, position in enumerate(trajectory.motion(np.array(image_times_s)).positions_m, start=1):

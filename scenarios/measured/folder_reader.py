@@ -83,6 +83,11 @@ class FolderReader:
         measurements: dict[str, Any] = {}
         truth = self._read_truth(images)
         if self.file.task == VELOCITY:
+            if len({"vx_m_s" in row.numbers for row in rows[1:]}) > 1:
+                raise rows[1].error(
+                    f"case '{name}': vx_m_s to vz_m_s are given for one pair of images only; allowed: for both, or for "
+                    "none with measured positions"
+                )
             measurements["interval_velocities_m_s"] = tuple(map(self._mean_velocity, images, images[1:]))
             measurements["sun_direction"] = _to_vector(self._sun(rows[0]).direction)
         elif self.file.task == LANDING:
@@ -173,6 +178,8 @@ class FolderReader:
             if is_map and position is None:
                 raise row.error("x_m, y_m, z_m are empty; map needs them with an attitude")
             return _PosedCamera(framed.camera, attitude, position)
+        if _POSITION[0] in row.numbers:
+            raise row.error("x_m, y_m, z_m are given, but qx to qw are not; a position needs an attitude in its row")
         if is_map and (map_origin is None or not is_mars_fixed(framed, product)):
             return _PosedCamera(mount_looking_down(framed.camera), None, None)
         camera, frame, frame_from_body = label_pose(row, framed, product)
@@ -223,6 +230,9 @@ class FolderReader:
             flat_field, shape = self.flat_fields[path]
             if shape != counts.shape:
                 raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels, unlike {row.texts['file']}")
+        detector, exposure_s = self.file.detector, row.numbers.get("exposure_s", self.file.detector.exposure_s)
+        if exposure_s == 0.0 and detector.transfer_row_s + detector.clear_row_s > 0.0:
+            raise row.error("exposure_s is 0 or empty; a frame transfer (transfer_row_s, clear_row_s) needs it")
         return store.StoredImage(
             source=row.texts["file"],
             size=camera.size,
@@ -230,7 +240,7 @@ class FolderReader:
             camera=self.cameras[camera],
             flat_field=flat_field,
             time_s=image.time_s,
-            exposure_s=row.numbers.get("exposure_s", self.file.detector.exposure_s),
+            exposure_s=exposure_s,
             world_from_body_xyzw=None if posed.attitude is None else _to_quaternion(posed.attitude),
             position_m=None if posed.position_m is None else _to_vector(posed.position_m),
             altitude_m=row.numbers.get("altitude_m"),
@@ -242,11 +252,24 @@ class FolderReader:
         """Return the mean velocity between two images: the inertial velocity, or computed from measured positions."""
         inertial = later.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
         if inertial is not None:
-            return _to_vector(self._to_world(later.row, inertial))
+            return _to_vector(self._mean_velocity_of_camera(inertial, earlier, later))
         start_m, end_m = earlier.posed.position_m, later.posed.position_m
         if start_m is None or end_m is None:
             raise later.row.error("vx_m_s to vz_m_s and the positions are empty; velocity needs one of them")
         return _to_vector((end_m - start_m) / (later.time_s - earlier.time_s))
+
+    def _mean_velocity_of_camera(
+        self, vehicle_m_s: Float64[np.ndarray, "3"], earlier: _RecordedImage, later: _RecordedImage
+    ) -> Float64[np.ndarray, "3"]:
+        """Convert a mean velocity of the recorded vehicle to that of the camera, in world axes."""
+        velocity = self._to_world(later.row, vehicle_m_s)
+        rotations = [image.row.rotation() for image in (earlier, later)]
+        if self.file.poses is None or None in rotations:
+            return velocity
+        start_m, end_m = (
+            self.file.poses.lever_arms(self.file.poses.enu_from_axes * rotation) for rotation in filter(None, rotations)
+        )
+        return np.asarray(velocity + (end_m - start_m) / (later.time_s - earlier.time_s))
 
     def _sun(self, row: ImageRow) -> SunTable:
         """Return the sun of a case: that of its first row, by default that of the folder."""
@@ -272,31 +295,37 @@ class FolderReader:
         return _to_vector(posed.position_m + posed.attitude.apply(ground))
 
     def _read_truth(self, images: Sequence[_RecordedImage]) -> store.StoredTruth:
-        """Read true poses and, for a descent, the true mean velocity from the second to the third image."""
+        """Read the true mean velocity of a descent from the second to the third image, or the true poses of a landing.
+
+        Raises IngestError for an incomplete truth, which would not be used.
+        """
         rows = [image.row for image in images]
+        row = next((row for row in rows if any(name.startswith("true_") for name in row.numbers)), None)
+        if row is None:
+            return store.StoredTruth()
         poses = [self._true_pose(row) for row in rows]
-        last, velocity = images[-1], None
         if self.file.task == VELOCITY:
-            components = last.row.vector("true_vx_m_s", "true_vy_m_s")
+            components = rows[-1].vector("true_vx_m_s", "true_vy_m_s")
             earlier, later = poses[-2:]
-            mean = None
             if components is not None:
-                mean = self._to_world(last.row, np.array([*components, 0.0]))
+                mean = self._mean_velocity_of_camera(np.array([*components, 0.0]), *images[-2:])
             elif earlier is not None and later is not None:
                 (_, start_m), (_, end_m) = earlier, later
-                mean = (end_m - start_m) / (last.time_s - images[-2].time_s)
-            velocity = None if mean is None else (float(mean[0]), float(mean[1]))
-        has_pose = [
-            row.rotation("true_") is not None and pose is not None for row, pose in zip(rows, poses, strict=True)
-        ]
-        if not any(has_pose):
-            return store.StoredTruth(velocity_m_s=velocity)
-        if not all(has_pose):
-            raise rows[0].error("some images have a true pose and some have none")
+                mean = (end_m - start_m) / (images[-1].time_s - images[-2].time_s)
+            else:
+                raise row.error(
+                    "a true velocity or position is given, but none for the last two images; allowed: true_vx_m_s and "
+                    "true_vy_m_s of the third image, or true positions of the second and third"
+                )
+            return store.StoredTruth(velocity_m_s=(float(mean[0]), float(mean[1])))
+        if None in poses or any(row.rotation("true_") is None for row in rows):
+            raise row.error(
+                "the truth is incomplete; allowed: true_x_m to true_z_m and true_qx to true_qw of both images"
+            )
         true_poses = tuple(
             (_to_vector(position), _to_quaternion(attitude)) for attitude, position in filter(None, poses)
         )
-        return store.StoredTruth(velocity_m_s=velocity, poses=true_poses)
+        return store.StoredTruth(poses=true_poses)
 
     def _true_pose(self, row: ImageRow) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
         """Return the body's true attitude (by default the measured attitude) and position; None without a position."""

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, UInt16
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from marsyard.scenarios.measured.layout import IngestError
+from marsyard.scenarios.missing_heights import find_missing_value
 from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.files import open_regular, read_npy_header, report_damage
 
@@ -29,6 +30,8 @@ _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 p
 LOSSY_FORMATS = ("JPEG", "JPEG2000")
 _ALLOWED_PUBLISHED = "allowed: PNG, PGM, TIFF or JPEG with 8 or 16 bits"
 _COLOURS = 3
+#: Tag of the meaning of counts in a TIFF, and its value for negative images. OpenCV inverts those of 8 bits only.
+_PHOTOMETRIC, _WHITE_IS_ZERO = ExifTags.Base.PhotometricInterpretation, 0
 
 
 def read_header(path: Path) -> bytes:
@@ -74,11 +77,20 @@ def lossy_bits_per_pixel(path: Path) -> float | None:
     return 8.0 * path.stat().st_size / (columns * rows) if name in LOSSY_FORMATS else None
 
 
-def read_elevation(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-    """Read an array of elevations, and interpolate it to a number of columns and rows. Raises IngestError."""
+def read_elevation(path: Path, size: tuple[int, int], pixel_m: float) -> Float32[np.ndarray, "rows columns"]:
+    """Read an array of elevations, and interpolate it to a number of columns and rows. Raises IngestError.
+
+    - pixel_m: size of a pixel after the interpolation
+    """
     elevation = _read_array(path, "array of elevations").astype(np.float32)
     if not np.all(np.isfinite(elevation)):
         raise IngestError(f"{path}: has elevations that are not finite; allowed: metres, without holes")
+    missing = find_missing_value(elevation.astype(np.float64), pixel_m * size[0] / elevation.shape[1])
+    if missing is not None:
+        raise IngestError(
+            f"{path}: the elevation {missing.height_m:g} m at {missing.posts} points is probably a value for missing "
+            "data; allowed: metres, without holes"
+        )
     return np.asarray(cv2.resize(elevation, size, interpolation=cv2.INTER_LINEAR))
 
 
@@ -104,6 +116,10 @@ def read_format(path: Path, size: tuple[int, int] | None = None, *, is_published
         except Image.DecompressionBombError as error:
             limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
             raise IngestError(f"{path}: has too many pixels; allowed: at most {limit}") from error
+        if image.format == "TIFF" and image.getexif().get(_PHOTOMETRIC) == _WHITE_IS_ZERO:
+            raise IngestError(
+                f"{path}: its counts are 0 for white (PhotometricInterpretation 0); allowed: 0 for black (1)"
+            )
         if image.format in LOSSY_FORMATS:
             image.load()  # OpenCV fills the missing part of a truncated file with grey
         orientation, (columns, rows) = image.getexif().get(ExifTags.Base.Orientation, 1), image.size

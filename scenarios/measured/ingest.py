@@ -1,5 +1,7 @@
 """Convert a folder of recorded images into stored cases and their campaign: `marsyard ingest`."""
 
+import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from marsyard.algorithms.dimes.views import binned_size_for
@@ -24,6 +26,8 @@ from marsyard.sim.camera import CameraModel
 #: Maximum number of rows that a detector sums, and maximum relative deviation of the ratio of the focal lengths from a
 #: whole number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
+#: Difference below which a true velocity is the same measurement as the velocity of an interval, m/s.
+_EQUAL_M_S = 1e-3
 #: Default description of a campaign, by task.
 _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three images.",
@@ -56,12 +60,15 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         columns, rows = stored_cases.cases[0].images[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
+    description = stored_cases.description or _DESCRIPTIONS[stored_cases.task]
     if stored_cases.task == MAP:
         note = describe_poses(stored_cases)
+    warnings = "\n".join(_find_warnings(stored_cases))
+    note, description = f"{note}\n{warnings}".strip(), " ".join([description, *warnings.splitlines()])
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
     text = template.render(
         **stored_cases.model_dump(include={"folder", "name", "task"}),
-        description=stored_cases.description or _DESCRIPTIONS[stored_cases.task],
+        description=description,
         cases=len(stored_cases.cases),
         file=str(final / path.name),
         binned_size=binned_size,
@@ -72,6 +79,24 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         velocity_is_known=any(case.truth.velocity_m_s is not None for case in stored_cases.cases),
     )
     return Ingested(text, len(stored_cases.cases), sum(len(case.images) for case in stored_cases.cases), note)
+
+
+def _find_warnings(stored_cases: store.StoredCases) -> Iterator[str]:
+    """Yield what limits the evidence of the cases, in one sentence each; it is also in the report."""
+    cases = stored_cases.cases
+    distinct = len({tuple(image.counts.sha256 for image in case.images) for case in cases})
+    if distinct < len(cases):
+        yield f"Only {distinct} of {len(cases)} cases have different images; rates count all cases."
+    known = sum(
+        math.dist(case.truth.velocity_m_s, case.interval_velocities_m_s[-1][:2]) < _EQUAL_M_S
+        for case in cases
+        if case.truth.velocity_m_s is not None and case.interval_velocities_m_s is not None
+    )
+    if known:
+        yield (
+            f"The true velocity of {known} of {len(cases)} cases is also an input of the algorithms: those that use "
+            "this velocity, and not only its change as DIMES, have no error."
+        )
 
 
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
@@ -91,7 +116,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
             problems.append(str(error))
     if problems:
         raise IngestError(format_problems(table, problems))
-    detector, first_camera = file.detector, next(iter(reader.cameras))
+    detector = file.detector
     stored_cases = store.StoredCases(
         schema_version=store.SCHEMA,
         name=file.name,
@@ -101,7 +126,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         detector=store.StoredDetector(
             **detector.model_dump(include={"offset_dn", "transfer_row_s", "clear_row_s"}),
             full_scale_dn=(1 << detector.bits) - 1,
-            rows_summed=infer_summed_rows(first_camera) if detector.rows_summed is None else detector.rows_summed,
+            rows_summed=detector.rows_summed or _infer_common_rows(source, reader.cameras),
         ),
         cases=tuple(cases),
     )
@@ -110,6 +135,17 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         return path, stored_cases
     stored_cases = add_map(source, file.map, store.CasesFile(file=str(path)))
     return store.write_cases(target, stored_cases), stored_cases
+
+
+def _infer_common_rows(source: Path, cameras: Iterable[CameraModel]) -> int:
+    """Infer the number of summed rows, which is that of all cameras. Raises IngestError if they differ."""
+    first, *others = sorted({infer_summed_rows(camera) for camera in cameras})
+    if others:
+        raise IngestError(
+            f"{source / INGEST_FILE}: detector.rows_summed is {first} for one camera and {others[0]} for another, by "
+            "their focal lengths; allowed: one number for all images: ingest the cameras separately"
+        )
+    return first
 
 
 def infer_summed_rows(camera: CameraModel) -> int:

@@ -27,7 +27,7 @@ from marsyard.scenarios.measured.pose_agreement import (
     compare_with_poses,
     match_images,
 )
-from marsyard.scenarios.measured.store import MeasuredParameters
+from marsyard.scenarios.measured.store import RECORDED_CASE, MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite
 from marsyard.scenarios.typed_scenario import TypedScenario
@@ -53,6 +53,7 @@ class MeasuredLandingScenario(TypedScenario[MeasuredLandingParameters]):
 
     name = "measured-landing"
     parameters_type = MeasuredLandingParameters
+    recorded_case = RECORDED_CASE
     task = LANDING
     algorithm_table = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}

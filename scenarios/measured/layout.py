@@ -244,6 +244,14 @@ def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
                 problems.append(
                     f"line {rows[0].line}: case '{name}' has {len(rows)} images; allowed for {task}: {number}"
                 )
+            lines: dict[str, int] = {}
+            for row in rows:
+                first_line = lines.setdefault(row.texts["file"], row.line)
+                if first_line != row.line and task != MATCHING:
+                    problems.append(
+                        f"line {row.line}: {row.texts['file']} is also the image of line {first_line}; allowed: "
+                        "different images in a case"
+                    )
             for previous, row in itertools.pairwise(rows):
                 first, second = previous.numbers.get("time_s"), row.numbers.get("time_s")
                 if first is not None and second is not None and second <= first:

@@ -128,7 +128,7 @@ def _read_map(source: Path, table: MapTable) -> MapProduct:
         raise IngestError(f"{path}: all pixels of the map are equal; allowed: an image of the ground")
     elevation = np.zeros((rows, columns), dtype=np.float32)
     if table.elevation is not None:
-        elevation = read_elevation(source / table.elevation, (columns, rows))
+        elevation = read_elevation(source / table.elevation, (columns, rows), table.pixel_m)
     # row 0 of a file is the northernmost, row 0 of a map the southernmost
     appearance, elevation = (np.ascontiguousarray(raster[::-1], dtype=np.float32) for raster in (counts, elevation))
     return create_map(appearance, elevation, table.pixel_m)

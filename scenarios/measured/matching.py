@@ -19,7 +19,7 @@ from marsyard.scenarios.measured.pose_agreement import (
     compare_with_poses,
     match_images,
 )
-from marsyard.scenarios.measured.store import MeasuredParameters
+from marsyard.scenarios.measured.store import RECORDED_CASE, MeasuredParameters
 from marsyard.scenarios.typed_scenario import TypedScenario
 from marsyard.sim.camera import camera_pose
 from marsyard.sim.measurements import DetectorImage
@@ -62,6 +62,7 @@ class MatchingScenario(TypedScenario[MatchingParameters]):
 
     name = "measured-matching"
     parameters_type = MatchingParameters
+    recorded_case = RECORDED_CASE
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one case."""

@@ -20,7 +20,7 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.counterparts import Counterpart, CounterpartParameters, render_counterpart
 from marsyard.scenarios.measured.map_matching import MapComparison, compare_with_map
 from marsyard.scenarios.measured.map_registration import extract_features, load_map, register_on_map
-from marsyard.scenarios.measured.store import MeasuredParameters
+from marsyard.scenarios.measured.store import RECORDED_CASE, MeasuredParameters
 from marsyard.scenarios.typed_scenario import TypedScenario
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.parameters import NonNegative
@@ -57,6 +57,7 @@ class OverMapScenario(TypedScenario[OverMapParameters]):
 
     name = "measured-map"
     parameters_type = OverMapParameters
+    recorded_case = RECORDED_CASE
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one case. Without a pose of the recorded image, there is no rendered image."""

@@ -28,6 +28,8 @@ from marsyard.sim.parameters import Parameters
 #: Version of `cases.json`, and its name.
 SCHEMA = 1
 CASES_FILE = "cases.json"
+#: Name of the parameter that selects a case of the file.
+RECORDED_CASE = "number"
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

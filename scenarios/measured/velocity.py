@@ -26,7 +26,7 @@ from marsyard.scenarios.measured.pose_agreement import (
     compare_with_poses,
     match_images,
 )
-from marsyard.scenarios.measured.store import MeasuredParameters
+from marsyard.scenarios.measured.store import RECORDED_CASE, MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
 from marsyard.scenarios.typed_scenario import TypedScenario
@@ -59,6 +59,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
 
     name = "measured-velocity"
     parameters_type = MeasuredVelocityParameters
+    recorded_case = RECORDED_CASE
     task = VELOCITY
     algorithm_table = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}

@@ -3,12 +3,15 @@
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import create_campaign, load_campaign
+from marsyard.campaigns.errors import DefinitionError
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.scenarios.conformance import inputs
 from tests.command import run_command
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
@@ -32,6 +35,8 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     page = (run / "report.html").read_text()
     assert "Images compared with measured poses" in page
     assert 'aria-label="Images 1 and 2: ' in page
+    status, output = run_command("append", str(run), "1")
+    assert (status, "2 cases repeat recorded cases" in " ".join(output.split())) == (2, True)
     status, output = run_command("replay", str(run), "0", "--out", str(tmp_path / "again"))
     assert (status, "the row equals the stored one" in output) == (0, True)
     assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
@@ -55,6 +60,47 @@ def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
     assert [campaign.parameters(case).case.name for case in range(2)] == ["one", "two"]  # type: ignore[attr-defined]
     # the identity of the campaign includes the hash of all images
     assert len(campaign.definition.parameters["cases"]["sha256"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cases": 4}, "4 cases repeat recorded cases, but the same images are no further evidence; allowed here: 2"),
+        (
+            {"dispersions": {"number": {"distribution": "choice", "values": [0, 1]}}},
+            "allowed: a grid of different numbers",
+        ),
+        (
+            {"dispersions": {"number": {"distribution": "grid", "values": [1, 1]}}},
+            "allowed: a grid of different numbers",
+        ),
+        ({"dispersions": {}}, "2 cases repeat recorded cases"),
+    ],
+)
+def test_recorded_cases_are_run_once(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    descent = inputs.descent()
+    folder = write_velocity_folder(tmp_path / "in", {"one": descent, "two": descent}, {})
+    assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
+    tables = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text())
+    with pytest.raises(DefinitionError, match=message):
+        create_campaign(tables | change, "test")
+    status, output = run_command("run", str(tmp_path / "out" / "campaign.toml"), "--confirm")
+    assert status == 2
+    assert "recorded cases are the same for every seed" in " ".join(output.split())
+    definition = {"scenario": "measured-velocity", "dispersions": change.get("dispersions", {})}
+    assert "recorded cases are not random draws" in read_sampling_design(definition).no_probability_reason
+
+
+def test_truth_that_is_an_input_and_repeated_images_are_reported(tmp_path: Path) -> None:
+    descent = inputs.descent()
+    folder = write_velocity_folder(tmp_path / "in", {"one": descent, "two": descent}, {})
+    rows = read_rows(folder)
+    write_text_rows(folder, [{**row, "true_vx_m_s": row["vx_m_s"], "true_vy_m_s": row["vy_m_s"]} for row in rows])
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"))
+    assert status == 0
+    for text in ("The true velocity of 2 of 2 cases is also an input", "Only 1 of 2 cases have different images"):
+        assert text in " ".join(output.split())
+        assert text in (tmp_path / "out" / "campaign.toml").read_text()
 
 
 def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:

@@ -224,7 +224,9 @@ READERS: Mapping[str, Reader] = {
         "image.jpg", _write_image, lambda path: read_counts(path, (48, 32), is_published=True), IngestError
     ),
     "elevations": Reader(
-        "elevation.npy", lambda path: np.save(path, np.ones((32, 48))), lambda path: read_elevation(path, (24, 16)),
+        "elevation.npy",
+        lambda path: np.save(path, np.ones((32, 48))),
+        lambda path: read_elevation(path, (24, 16), 6.0),
         IngestError,
     ),
     "flat field npy": Reader("flat.npy", lambda path: np.save(path, np.ones((32, 48))), read_flat_field, IngestError),

@@ -149,6 +149,10 @@ GEOTIFF_FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"values": np.full((50, 40), 120, dtype=np.uint8), "nodata": None}, "8-bit values, as in an image"),
     ({"values": np.full((50, 40), -32767.0, dtype=np.float32)}, "has no valid height at all"),
     ({"tags": {"units": ("ft",)}}, "heights are in 'ft'; allowed: metres"),
+    (
+        {"crs": CRS.from_string("EPSG:32610+5715"), "transform": Affine(1.0, 0.0, 500_000.0, 0.0, -1.0, 4_000_000.0)},
+        "its vertical axis points down",
+    ),
     ({"tags": {"scales": (0.1,)}}, "has scale 0.1 and offset 0; apply them"),
 ]
 

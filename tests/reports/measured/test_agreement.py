@@ -51,6 +51,19 @@ def test_section_reports_residuals_and_unmatched_cases() -> None:
     assert len(block.figures) == 1
 
 
+def test_infinite_residuals_are_not_missing_ones() -> None:
+    """The poses of case b place the matches outside of the view of the later camera."""
+    section = agreement_section(
+        make_subject(
+            measured_case=list("abcd"), residual_median_px=[0.4, np.inf, 0.6, np.inf], matches=[120, 110, 9, 80]
+        )
+    )
+    (block,) = section.blocks
+    assert [row[4] for row in block.grid.rows] == ["0.400", "out of view", "0.600", "out of view"]
+    assert (section.data["unmatched"], section.data["out_of_view"]) == (0, 2)
+    assert section.data["median_of_medians_px"] is None
+
+
 def test_no_section_without_recorded_cases() -> None:
     assert agreement_section(make_subject(residual_median_px=[1.0] * 4)) is None
 

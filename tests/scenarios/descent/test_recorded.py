@@ -72,6 +72,25 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
         assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], rel=0.02, abs=1e-4), name
 
 
+@pytest.mark.parametrize("unit_s", [1e-3, 1e-9])
+def test_flights_with_large_gaps_are_rejected(tmp_path: Path, unit_s: float) -> None:
+    """With times in milliseconds or nanoseconds instead of seconds, the lander would hover during the images."""
+    times = np.arange(0.0, 25.0, 0.1)
+    positions = np.column_stack([10.0 * times, 0.0 * times, 2200.0 - 70.0 * times])
+    down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    file = _write_poses(tmp_path, times / unit_s, positions, Rotation.concatenate([down] * times.size))
+    with pytest.raises(ValidationError, match=r"pose 2 is .* s after the pose before it; allowed .*up to 2 s"):
+        DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
+
+
+def test_flight_with_a_gap_after_the_images_is_accepted(tmp_path: Path) -> None:
+    times = np.append(np.arange(0.0, 25.0, 0.1), 60.0)
+    positions = np.column_stack([10.0 * times, 0.0 * times, 5000.0 - 70.0 * times])
+    down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    file = _write_poses(tmp_path, times, positions, Rotation.concatenate([down] * times.size))
+    DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
+
+
 def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
     file = _write_vertical_fall(tmp_path)
     parameters = DescentScenarioParameters.model_validate(

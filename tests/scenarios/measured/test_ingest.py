@@ -17,6 +17,7 @@ from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.matching import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
+from marsyard.sim.camera import write_cahvor
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
@@ -62,6 +63,21 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
         (lambda rows: [{**row, "altitude_ft": "1"} for row in rows], "'altitude_ft' (did you mean 'altitude_m'?)"),
         (lambda rows: [{**row, "slant_range_m": "1"} for row in rows], "unknown column 'slant_range_m'"),
         (lambda rows: change_cells(rows, 0, camera="none.cahvor"), "none.cahvor: file: cannot be read"),
+        (
+            lambda rows: change_cells(rows, 2, vx_m_s="", vy_m_s="", vz_m_s=""),
+            "line 3: case 'drop': vx_m_s to vz_m_s are given for one pair of images only",
+        ),
+        (
+            lambda rows: [
+                {**row, "true_vx_m_s": cell, "true_vy_m_s": cell} for row, cell in zip(rows, ("", "3", ""), strict=True)
+            ],
+            "line 3: a true velocity or position is given, but none for the last two images",
+        ),
+        (
+            lambda rows: [{**row, "exposure_s": "0"} for row in rows],
+            "line 2: exposure_s is 0 or empty; a frame transfer",
+        ),
+        (lambda rows: change_cells(rows, 2, file="drop-1.png"), "line 4: drop-1.png is also the image of line 3"),
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
@@ -168,6 +184,40 @@ def test_rotated_images_are_refused(tmp_path: Path, write: Callable[[Path, np.nd
                 IngestError, match=rf"{orientation}.image: has the orientation {orientation} .*allowed: 1"
             ):
                 read_counts(path, (8, 6))
+
+
+def test_negative_images_are_refused(tmp_path: Path) -> None:
+    """A TIFF with PhotometricInterpretation 0 (white is zero): OpenCV inverts those of 8 bits, but not of 16."""
+    path = tmp_path / "negative.tif"
+    tags = {256: 8, 257: 6, 258: 16, 259: 1, 262: 0, 273: 200, 277: 1, 278: 6, 279: 96}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", 0)
+    path.write_bytes(head.ljust(200, b"\0") + np.arange(48, dtype="<u2").tobytes())
+    with pytest.raises(IngestError, match=r"negative.tif: its counts are 0 for white .*allowed: 0 for black"):
+        read_counts(path, (8, 6))
+
+
+@pytest.mark.parametrize("names", [("true_qx", "true_qy", "true_qz", "true_qw"), ("true_x_m", "true_y_m", "true_z_m")])
+def test_incomplete_true_poses_are_rejected(tmp_path: Path, names: tuple[str, ...]) -> None:
+    folder = write_landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
+    write_text_rows(folder, drop_columns(read_rows(folder), *names))
+    assert "line 2: the truth is incomplete; allowed: true_x_m to" in ingest_and_expect_error(folder, tmp_path)
+
+
+def test_cameras_with_different_summed_rows_are_rejected(tmp_path: Path) -> None:
+    measurements = inputs.descent()
+    folder = write_velocity_folder(tmp_path / "in", {"one": measurements, "two": measurements}, {})
+    write_cahvor(measurements.images[0].camera.bin(2, 1), folder / "half.cahvor")
+    for number in range(3):
+        counts = measurements.images[number].counts
+        cv2.imwrite(str(folder / f"two-{number}.png"), counts.reshape(len(counts), -1, 2)[..., 0])
+    text = (folder / "ingest.toml").read_text()
+    kept = [line for line in text.splitlines() if not line.startswith(("rows_summed", "flat_field"))]
+    (folder / "ingest.toml").write_text("\n".join(kept))
+    write_text_rows(
+        folder, [{**row, "camera": "half.cahvor" if "two" in row["case"] else ""} for row in read_rows(folder)]
+    )
+    assert "detector.rows_summed is 2 for one camera and 4 for another" in ingest_and_expect_error(folder, tmp_path)
 
 
 def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Path, shared_data: Path) -> None:

@@ -151,6 +151,14 @@ def test_a_case_has_one_frame(tmp_path: Path, folder: Path, small_camera: Cahvor
         ingest(folder, tmp_path / "out")
 
 
+def test_positions_of_the_table_need_its_attitudes(tmp_path: Path, folder: Path, small_camera: Cahvor) -> None:
+    for number in (0, 1):
+        pds3_label(folder, small_camera, "ROVER_FRAME", name=f"{number}.img", clock=100.0 + number)
+    write_folder(folder, ["case,file,x_m,y_m,z_m", "a,0.img,0,0,0", "a,1.img,5,0,0"], '[poses]\naxes = "enu"\n')
+    with pytest.raises(IngestError, match="line 2: x_m, y_m, z_m are given, but qx to qw are not"):
+        ingest(folder, tmp_path / "out")
+
+
 def test_poses_in_different_sites_are_refused(tmp_path: Path, folder: Path, small_camera: Cahvor) -> None:
     pds3_label(folder, small_camera, "ROVER_FRAME", name="0.img")
     path = pds3_label(folder, small_camera, "ROVER_FRAME", name="1.img", clock=101.0)

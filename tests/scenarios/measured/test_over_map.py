@@ -147,6 +147,13 @@ POSE_TABLE = '[poses]\naxes = "enu"\nattitude_of = "body"\n'
         (lambda folder: cv2.imwrite(str(folder / "map.png"), np.ones((256, 256), np.uint8)), ["all pixels of the map"]),
         (lambda folder: np.save(folder / "elevation.npy", np.full((9, 9), np.nan)), ["elevation.npy", "not finite"]),
         (
+            lambda folder: np.save(
+                folder / "elevation.npy",
+                np.pad(np.arange(100.0).reshape(10, 10), 2) - 9999.0 * np.pad(np.zeros((10, 10)), 2, constant_values=1),
+            ),
+            ["elevation.npy", "the elevation -9999 m at 96 points is probably a value for missing data"],
+        ),
+        (
             lambda folder: (folder / "elevation.npy").write_text("1 2"),
             ["elevation.npy", "is not a valid array of elevations"],
         ),

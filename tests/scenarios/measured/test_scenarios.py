@@ -105,6 +105,26 @@ def test_positions_replace_inertial_velocities_and_truth(tmp_path: Path) -> None
     assert row["matches"] > 100
 
 
+def test_lever_arm_is_applied_to_velocities(tmp_path: Path) -> None:
+    """The camera is 40 m from the recorded vehicle, whose attitude changes from image to image."""
+    measurements, lever_m = inputs.descent(), np.array([40.0, 0.0, 0.0])
+    folder = write_velocity_folder(tmp_path / "in", {"drop": measurements}, {"drop": TRUE_VELOCITY_M_S})
+    text = (folder / "ingest.toml").read_text()
+    (folder / "ingest.toml").write_text(text.replace("[poses]", f"[poses]\nlever_m = {lever_m.tolist()}"))
+    (tmp_path / "out").mkdir()
+    _, stored_cases = ingest(folder, tmp_path / "out")
+    case = stored_cases.cases[0]
+    arms = np.array([image.attitude.apply(lever_m) for image in case.images])
+    times = np.array([image.time_s for image in case.images])
+    lever_m_s = np.diff(arms, axis=0) / np.diff(times)[:, None]
+    assert np.abs(lever_m_s).max() > 0.1
+    expected = measurements.interval_velocities_m_s + lever_m_s
+    assert case.interval_velocities_m_s is not None
+    assert case.truth.velocity_m_s is not None
+    assert np.allclose(case.interval_velocities_m_s, expected, rtol=0.0, atol=1e-9)
+    assert np.allclose(case.truth.velocity_m_s, TRUE_VELOCITY_M_S + lever_m_s[1, :2], rtol=0.0, atol=1e-9)
+
+
 def test_landings_are_compared_with_measured_and_true_poses(tmp_path: Path) -> None:
     folder = write_landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
     row: dict[str, Any] = dict(run_ingested(folder, tmp_path / "out", scores=[f"{__name__}:score_site"]).row)
