@@ -26,14 +26,14 @@ SUFFIXES = (".png", ".npz", ".cahvor", ".json")
 def truth_layers(image: RenderedImage) -> dict[str, Any]:
     """Compute the ground-truth layers, each with the rows and columns of the image, and the pose.
 
-    The shadow is found by rendering the image again, in direct sunlight only.
+    The shadow is found by rendering the image again, in the light of the sun's disc only.
     """
     frame, scene = image.frame, image.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
     is_ground = np.isfinite(frame.range_m)
-    # without diffuse light, pixels with zero radiance are in shadow
-    direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
+    # without diffuse light and aureole, pixels with zero radiance are in shadow
+    direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0, sky=None)
     direct_frame = process_renderer(default_backend()).render(
         scene.with_photometry(direct_light).with_edge_rays(1), frame.rays, frame.world_from_body
     )
@@ -87,7 +87,7 @@ def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any
         "png": png,
         "npz": {
             "object": "number of the visible rock; -1 ground, -2 sky",
-            "shadow": "no direct sunlight: a cast shadow, or a surface that faces away from the sun",
+            "shadow": "no light from the sun's disc: a cast shadow, or a surface that faces away from the sun",
             "frame": "world: x east, y north (grid north for a DTM), z up, metres",
             "filled": "the pixel sees a filled hole of the DTM",
         },

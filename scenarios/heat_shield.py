@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import State
@@ -21,6 +21,8 @@ SHIELD_DRIFT_M_S, SHIELD_TUMBLE_RAD_S = 2.0, 1.0
 SHIELD_MAX_OFF_NADIR_RAD = 0.2
 #: Smallest cosine between a ray and the shield's normal, which keeps the distance of the intersection finite.
 _MIN_COSINE = 1e-9
+#: Body number of the shield, which is no row of the scene's objects.
+SHIELD_BODY = np.int32(2**31 - 1)
 #: Assumed albedos of the shield: charred outside, insulated inside.
 SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO = 0.1, 0.5
 
@@ -55,10 +57,11 @@ class HeatShield:
             start_s=first.time_s,
         )
 
-    def paint_over(
-        self, radiance: Float32[np.ndarray, "rows columns"], frame: Frame, sun: Sun, time_s: float
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Paint the shield over an image's radiance factor: a Lambert surface, lit by the sun only."""
+    def paint_over(self, frame: Frame, sun: Sun, time_s: float) -> Frame:
+        """Return an image, and its ground truth, with the shield in front of the ground.
+
+        The shield is a Lambert surface, lit by the sun only. Its number among the bodies is `SHIELD_BODY`.
+        """
         elapsed_s = time_s - self.start_s
         centre = self.centre_m + elapsed_s * self.velocity_m_s
         normal = Rotation.from_rotvec(elapsed_s * self.spin_rad_s).apply(self.normal)
@@ -67,9 +70,16 @@ class HeatShield:
         cosines = directions @ normal
         distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > _MIN_COSINE, cosines, _MIN_COSINE)
         centre_distance = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
-        is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M)
+        is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M) & (distance < frame.range_m.ravel())
+        is_hit, distance, cosines = (values.reshape(frame.range_m.shape) for values in (is_hit, distance, cosines))
         # the camera sees the outside if the normal points towards it, otherwise the inside
-        sun_cosine = np.maximum(-np.sign(cosines) * float(normal @ sun.direction), 0.0)
-        reflected = np.where(cosines < 0.0, SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO) * sun_cosine
-        painted = np.where(is_hit, reflected, radiance.reshape(-1))
-        return painted.astype(np.float32).reshape(radiance.shape)
+        side = -np.sign(cosines)
+        sun_cosine = np.maximum(side * float(normal @ sun.direction), 0.0)
+        reflected = np.where(side > 0.0, SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO) * sun_cosine
+        return replace(
+            frame,
+            radiance=np.where(is_hit, reflected, frame.radiance).astype(np.float32),
+            range_m=np.where(is_hit, distance, frame.range_m),
+            body=np.where(is_hit, SHIELD_BODY, frame.body),
+            normal=np.where(is_hit[..., None], side[..., None] * normal, frame.normal).astype(np.float32),
+        )

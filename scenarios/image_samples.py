@@ -18,6 +18,9 @@ from marsyard.sim.streams import Streams
 class ImageSample:
     """An image and the truth of each pixel.
 
+    With summed rows, normal, rocks and hazard are those of a rendered row at most half a rendered row from the pixel's
+    centre (`select_middle_rows`).
+
     - image: counts of `bits` bits, as delivered
     - range_m: distance along the pixel's ray to the surface; infinite for the sky
     - normal: unit normal of the surface, world axes
@@ -37,9 +40,25 @@ class ImageSample:
     metadata: Mapping[str, Any]
 
 
+#: Maximum relative difference between the ranges of two rendered rows that see the same surface.
+_MAX_RANGE_STEP = 0.02
+
+
 def select_middle_rows(rows_summed: int) -> slice:
-    """Select the rendered row in the middle of each group of summed rows: it represents the truth of an image row."""
+    """Select the rendered row in the middle of each group of summed rows, or the lower of both middle rows."""
     return slice(rows_summed // 2, None, rows_summed)
+
+
+def interpolate_range(frame: Frame, rows_summed: int) -> Float32[np.ndarray, "rows columns"]:
+    """Compute the range at the centre of each delivered pixel: of even numbers, the mean of both middle rows.
+
+    Where the two rows see different surfaces, the range is that of the lower row.
+    """
+    below = frame.range_m[rows_summed // 2 :: rows_summed]
+    above = frame.range_m[(rows_summed - 1) // 2 :: rows_summed]
+    with np.errstate(invalid="ignore"):  # sky in both rows
+        is_same_surface = np.abs(below - above) < _MAX_RANGE_STEP * below
+    return np.where(is_same_surface, 0.5 * (below + above), below).astype(np.float32)
 
 
 @runtime_checkable
@@ -63,7 +82,7 @@ def pixel_sample(
     return ImageSample(
         image=counts,
         bits=detector.bits,
-        range_m=frame.range_m[rows].astype(np.float32),
+        range_m=interpolate_range(frame, detector.rows_summed),
         normal=frame.normal[rows],
         rocks=(frame.body[rows] >= 0).astype(np.uint8),
         hazard=hazard,

@@ -31,7 +31,7 @@ def take_exposures(
     detector: Detector,
     streams: Streams,
 ) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
-    """Render and expose the images; yield detector counts and rendered frame of each image.
+    """Render and expose the images; yield detector counts and the frame, with haze, of each image.
 
     Faults of the transmission (repeated or black images) are added later.
     """
@@ -52,10 +52,11 @@ def take_exposures(
         frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
         height = float(state.position_m[2]) - float(surface.height(*state.position_m[:2]))
         extinction = world.air.mean_extinction_m(height) if world.ground else 0.0
-        radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_PATH_M)
+        haze = extinction + p.faults.haze / HAZE_PATH_M
+        frame = replace(frame, radiance=add_haze(frame, world.air, world.sun, haze))
         if shield is not None:
-            radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
-        yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
+            frame = shield.paint_over(frame, world.sun, state.time_s)
+        yield detector.expose(frame.radiance * np.float32(world.brightness), noise, motion), frame
 
 
 def draw_mounting(p: DescentScenarioParameters, streams: Streams) -> RigidTransform:

@@ -109,7 +109,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     distance = pair.baseline_fraction * pair.height_m
     step = np.array([distance * np.sin(course), distance * np.cos(course), pair.climb_fraction * pair.height_m])
     interval = max(float(np.linalg.norm(step)) / max(pair.speed_m_s, MIN_SPEED_M_S), MIN_INTERVAL_S)
-    velocity = pair.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
+    velocity = step / interval
     rates = np.radians(pair.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
     start = np.array(first.translation)
     return (

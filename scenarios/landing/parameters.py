@@ -57,7 +57,7 @@ class ImagePoseParameters(Parameters):
 
     height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first image, m")
     baseline_fraction: float = Field(default=0.2, ge=0.0, le=2.0, description="horizontal distance divided by height")
-    speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
+    speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the line between the images, m/s")] = 3.0
     heading_deg: Annotated[Angle, Field(description="azimuth of the image's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="clockwise from the upper edge; 90: along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="angle of the first optical axis from nadir")] = 0.0

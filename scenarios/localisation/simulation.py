@@ -146,11 +146,11 @@ def _take_images(
         scene = world.move_scene(scene, east_m, north_m, max(height, _MIN_HEIGHT_M))
         frame, motion = render_state(p.render.backend, scene, optics, state)
         extinction = world.air.mean_extinction_m(height) + p.faults.haze / HAZE_PATH_M
-        radiance = add_haze(frame, world.air, world.sun, extinction)
+        frame = replace(frame, radiance=add_haze(frame, world.air, world.sun, extinction))
         if shield is not None:
-            radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
+            frame = shield.paint_over(frame, world.sun, state.time_s)
         counts: UInt16[np.ndarray, "rows columns"] = detector.expose(
-            radiance * np.float32(world.brightness), noise, motion
+            frame.radiance * np.float32(world.brightness), noise, motion
         )
         if number == p.faults.black_image:
             counts = np.zeros_like(counts)

@@ -268,9 +268,9 @@ class MastCameraParameters(Parameters):
     )
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
-    detector_noise: Annotated[bool, DETECTOR, Field(description="whether images have detector noise and response")] = (
-        True
-    )
+    detector_noise: Annotated[
+        bool, DETECTOR, Field(description="whether images have detector noise and response, with fall-off and dust")
+    ] = True
     defocus_px: Annotated[
         float | None,
         OPTICS,

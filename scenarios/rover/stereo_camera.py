@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import RigidTransform
@@ -16,6 +17,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastImage
 from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
 from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
+from marsyard.sim.sensor.optics import apply_point_spread
 from marsyard.sim.streams import Streams
 
 #: Factor by which the full frame is reduced for auto-exposure.
@@ -47,8 +49,8 @@ class StereoImages:
 class StereoCamera:
     """The detectors of a stereo pair with sampled pixel responses.
 
-    Without detector noise, counts are proportional to the light and rounded to 12 bits. The left subframe sets the
-    exposure.
+    Without detector noise, counts are proportional to the light behind the optics, without fall-off and dust, and
+    rounded to 12 bits. The left subframe sets the exposure.
     """
 
     parameters: RoverScenarioParameters
@@ -106,12 +108,13 @@ class StereoCamera:
             detector, metering_radiance = windows[0], radiances[0]
             exposure_s = detector.parameters.exposure_s
             if p.exposure.metering == "full-frame":
-                # reduced full frame, and a detector of its size, whose response repeats if the subframe is smaller
+                # reduced full frame, and a detector of its size with the reduced response
                 reduced_rays = PixelRays.from_camera(cameras[0].scale(1.0 / _BINNING))
                 metering_radiance = render(add_rover(scene).with_edge_rays(1), reduced_rays)
-                rows, columns = metering_radiance.shape
-                response = np.resize(detector.response[:rows, :columns], (rows, columns))
-                detector = replace(detector, response=response, hot_e_s=None)
+                response = cv2.resize(
+                    self.detectors[0].response, metering_radiance.shape[::-1], interpolation=cv2.INTER_AREA
+                )
+                detector = replace(detector, response=response, hot_e_s=None, listed=None)
             if p.exposure.metering != "fixed":
                 auto_exposure = auto_expose(detector, metering_radiance, p.exposure.auto, self.noise)
                 exposure_s = auto_exposure.detector.parameters.exposure_s
@@ -120,6 +123,8 @@ class StereoCamera:
                 for window, radiance in zip(windows, radiances, strict=True)
             ]
         else:
+            optics = self.detectors[0].parameters.optics
+            radiances = [apply_point_spread(radiance, optics) for radiance in radiances]
             brightness_at_count = float(np.percentile(radiances[0], _EXACT_PERCENTILE))
             gain = _EXACT_COUNT / max(brightness_at_count, 1e-9)  # finite also without light
             full_scale = 2**_EXACT_BITS - 1

@@ -49,7 +49,8 @@ def is_sun_above_slopes(sun: Sun, max_slopes: tuple[float, float]) -> bool:
 
     No line between two points of the ground is then as steep as the rays to the lower edge of the disc.
     """
-    east, north, _ = np.abs(sun.direction)
+    # products of Python's floats: an infinite slope across the sun's azimuth gives NaN without a warning
+    east, north, _ = np.abs(sun.direction).tolist()
     return bool(max_slopes[0] * east + max_slopes[1] * north < _lower_edge_rise(sun))
 
 

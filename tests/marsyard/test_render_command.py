@@ -6,15 +6,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard import site_images
-from marsyard.image_files import SUFFIXES
+from marsyard.image_files import SUFFIXES, truth_layers
 from marsyard.sim.camera import read_cahvor
+from marsyard.sim.frames import rigid
 from marsyard.sim.kernel_cache import mark_ready
-from marsyard.sim.render import Objects, Sun, scene
-from marsyard.sim.render.backend import RenderingError
+from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, process_renderer, scene
+from marsyard.sim.render.backend import RenderingError, default_backend
 from marsyard.sim.render.casters import Casters, casters_towards
+from marsyard.sim.sensor import preset
+from marsyard.sim.terrain import Surface
+from marsyard.site_images import RenderedImage
 from tests.command import marsyard
 
 
@@ -48,6 +52,27 @@ def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         # surfaces that face away from the sun are in shadow; micro-relief, which normals omit, tilts by a few degrees
         assert truth["shadow"][is_surface][truth["normal"][is_surface] @ to_sun < -0.05].all()
         np.testing.assert_allclose(truth["world_from_body"], metadata["world_from_body"])
+
+
+def test_truth_layer_contains_shadows_in_the_light_of_the_aureole() -> None:
+    """The shadow of a horizontal triangle, 3 m above level ground, is the triangle moved away from the sun."""
+    corners = np.array([[-2.0, -2.0, 3.0], [3.0, -1.0, 3.0], [0.0, 2.0, 3.0]])
+    up, numbers = np.tile([0.0, 0.0, 1.0], (3, 1)), np.zeros(1, dtype=np.int32)
+    triangle = Objects.of_mesh(corners, up, np.array([[0, 1, 2]], dtype=np.int32), numbers, 0.2)
+    samples = np.broadcast_to(np.array([0.0, 0.2], dtype=np.float32), (64, 64, 2))
+    sun = Sun(np.array([0.48, 0.64, 0.6]))
+    light = Photometry(sky_fraction=0.3, sky=DustySky(0.9, 0.95, 0.65))
+    view = Scene(Surface.from_samples(samples, 1.0), (0.0, 0.0), sun, light, objects=triangle)
+    camera, pose = preset("xc-55").cameras()[0], rigid(Rotation.identity(), np.array([0.0, 0.0, 20.0]))
+    frame = process_renderer(default_backend()).render(view, PixelRays.from_camera(camera), pose)
+    layers = truth_layers(RenderedImage("", camera, camera, frame, view, None, None, None))
+    # barycentric weights of the points at which the rays to the sun pass the triangle's height
+    ground = layers["object"] == -1
+    crossings = layers["point_m"][ground][:, :2] + 3.0 / sun.direction[2] * sun.direction[:2]
+    weights = np.linalg.solve(np.vstack([corners[:, :2].T, np.ones(3)]), np.column_stack([crossings, ground[ground]]).T)
+    is_shaded, near_edge = weights.min(axis=0) > 0.0, np.abs(weights.min(axis=0)) < 0.01
+    assert is_shaded.sum() > 1000
+    np.testing.assert_array_equal(layers["shadow"][ground][~near_edge], is_shaded[~near_edge])
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics, take_exposures
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.scenarios.descent.world import DescentWorld
-from marsyard.scenarios.heat_shield import SHIELD_DIAMETER_M, HeatShield
+from marsyard.scenarios.heat_shield import SHIELD_BODY, SHIELD_DIAMETER_M, HeatShield
 from marsyard.scenarios.radiance import add_haze
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
@@ -86,15 +86,21 @@ def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
     heat_shield = HeatShield.draw(first_state, np.radians(angle_deg), np.random.default_rng(3))
     shield_direction = heat_shield.centre_m - first_state.position_m
     face_on = replace(heat_shield, normal=shield_direction / np.linalg.norm(shield_direction), spin_rad_s=np.zeros(3))
-    first_radiance = face_on.paint_over(frame.radiance, frame, SUN, 0.0)
+    image = face_on.paint_over(frame, SUN, 0.0)
     solid_angles_sr = frame.rays.pixel_angles.astype(np.float64) ** 2
-    covered_sr = solid_angles_sr[(first_radiance != frame.radiance).reshape(-1)].sum()
+    covered = image.radiance != frame.radiance
+    covered_sr = solid_angles_sr[covered.reshape(-1)].sum()
     assert covered_sr == pytest.approx(np.pi / 4.0 * np.radians(angle_deg) ** 2, rel=0.1)
     # The shield moves away at 20 m/s: 75 m in 3.75 s. Its solid angle decreases with the square of the distance.
-    later_radiance = face_on.paint_over(frame.radiance, frame, SUN, 3.75)
+    later_radiance = face_on.paint_over(frame, SUN, 3.75).radiance
     distance_m = SHIELD_DIAMETER_M / np.radians(angle_deg)
     area_ratio = solid_angles_sr[(later_radiance != frame.radiance).reshape(-1)].sum() / covered_sr
     assert area_ratio == pytest.approx((distance_m / (distance_m + 75.0)) ** 2, abs=0.05)
+    # the ground truth contains the shield, in front of the ground only
+    np.testing.assert_allclose(image.range_m[covered], distance_m, rtol=0.01)
+    np.testing.assert_array_equal(image.body == SHIELD_BODY, covered)
+    below_ground = replace(face_on, centre_m=face_on.centre_m - np.array([0.0, 0.0, 2000.0]))
+    np.testing.assert_array_equal(below_ground.paint_over(frame, SUN, 0.0).radiance, frame.radiance)
 
 
 def test_images_can_be_repeated_or_black() -> None:

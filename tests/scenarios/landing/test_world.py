@@ -7,6 +7,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing import kernels
+from marsyard.scenarios.landing.flight import true_states
 from marsyard.scenarios.landing.pair_choice import choose_pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.landing.relief import Limits, Relief
@@ -15,6 +16,7 @@ from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
+from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import site
 
 
@@ -34,6 +36,15 @@ def test_electron_count_does_not_depend_on_the_sun_distance_of_the_responsivity(
         parameters = LandingScenarioParameters.model_validate({**small_terrain, "detector": detector})
         electrons.append(LandingWorld.from_parameters(parameters).brightness * parameters.detector.responsivity_e_s)
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
+
+
+def test_velocity_at_the_images_is_that_of_the_motion_between_them() -> None:
+    poses = {"height_m": 20.0, "climb_fraction": -0.15, "speed_m_s": 0.65}
+    parameters = LandingScenarioParameters.model_validate({"terrain": {"samples": 256}, "image_poses": poses})
+    first, second = true_states(parameters, LandingWorld.from_parameters(parameters).surface, Streams(1, "poses", 0))
+    velocity = (second.position_m - first.position_m) / (second.time_s - first.time_s)
+    np.testing.assert_allclose([first.velocity_m_s, second.velocity_m_s], [velocity, velocity])
+    assert np.linalg.norm(velocity) == pytest.approx(0.65)
 
 
 @pytest.mark.parametrize(("bank", "n_built"), [(1, 1), (64, 64), (65, 0), (10_000, 0)])

@@ -5,12 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.algorithms.interface import PixelBox
 from marsyard.scenarios.rover.closed_loop import prepare_run, run_case
 from marsyard.scenarios.rover.designation import is_lit
 from marsyard.scenarios.rover.figures import run_timeline
 from marsyard.scenarios.rover.parameters import MastCameraParameters, MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run_state import RoverRun
+from marsyard.scenarios.rover.stereo_camera import StereoCamera, StereoImages
+from marsyard.scenarios.views import mast_pose
 from marsyard.sim.dynamics.rover import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
@@ -80,6 +83,39 @@ def test_bright_sky_underexposes_full_frames() -> None:
     assert exposure_ratio < 0.3
     contrast = {region: float(np.std(pair.left.counts.astype(float))) for region, pair in first_images.items()}
     assert contrast["full-frame"] == pytest.approx(contrast["subframe"] * exposure_ratio, rel=0.1)
+
+
+def take_pair(camera: dict[str, Any], box: PixelBox, metering: str = "subframe") -> tuple[StereoImages, int]:
+    """Take a pair from a mast that looks down 30 deg; return it with the full scale of its counts."""
+    changes = {"exposure": {"metering": metering}, "camera": {"preset": "research-navcam", **camera}}
+    parameters, streams = RoverScenarioParameters.model_validate({**SHORT_RUN, **changes}), Streams(1, "tests", 0)
+    setup = prepare_run(parameters, streams).setup
+    scene, head = setup.world.scene(0.0), setup.rig.head.true
+    pose = mast_pose(scene.surface, *scene.centre_m, 1.5, 90.0, -30.0)
+    stereo = StereoCamera.draw(parameters, streams)
+    pair = stereo.take(scene, None, pose, (head.left, head.right), (box, box), setup.world.brightness(0.0), 0.0)
+    return pair, 2**stereo.bits - 1
+
+
+def test_full_frame_is_metered_with_its_own_fall_off() -> None:
+    """The subframe has no effect on the exposure of full-frame metering, nor has a list of bad pixels.
+
+    The controlled percentile of the reduced frame is near its target, 0.75.
+    """
+    defects = {"detector": {"preset": "research-navcam", "defects": {"hot_fraction": 1e-3, "listed": True}}}
+    whole, full_scale = take_pair({}, PixelBox((0, 0), (1024, 768)), "full-frame")
+    corner, _ = take_pair(defects, PixelBox((0, 0), (64, 64)), "full-frame")
+    assert corner.exposure_s == pytest.approx(whole.exposure_s, rel=0.02)
+    reduced = whole.left.counts.reshape(48, 16, 64, 16).mean(axis=(1, 3))
+    assert np.percentile(reduced, 98.0) / full_scale == pytest.approx(0.75, abs=0.06)
+
+
+def test_images_without_detector_noise_have_the_blur_of_the_optics() -> None:
+    box = PixelBox((400, 300), (160, 160))
+    sharp, blurred = (
+        take_pair({"detector_noise": False, "defocus_px": defocus_px}, box)[0].left.counts for defocus_px in (0.0, 5.0)
+    )
+    assert np.abs(np.diff(blurred.astype(float))).mean() < 0.8 * np.abs(np.diff(sharp.astype(float))).mean()
 
 
 def test_lit_points_are_not_in_the_shadow_of_a_cloud() -> None:
