@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.scenarios.descent.faults import add_time_fault
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import IMU_MARGIN_S, SIMULATED_LEAD_S, DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import END_MARGIN_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, MotionInputs
@@ -18,10 +18,6 @@ from marsyard.sim.dynamics.swing import SwingDescent
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, Surface
 
-#: Duration of a simulated descent before the first image, s.
-SIMULATED_LEAD_S = 5.0
-#: Margin of the inertial unit's data: after the start of the motion and after the thrusters' firing, s.
-IMU_MARGIN_S = 0.1
 #: Number of times at which the height of a recorded or custom flight is compared with the firing height.
 _SEARCH_TIMES = 2000
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import Images
 from marsyard.scenarios.descent.faults import AttitudeTilts, add_altitude_faults
-from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
+from marsyard.scenarios.descent.flight import DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import IMU_MARGIN_S, DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (

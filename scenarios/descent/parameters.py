@@ -41,10 +41,15 @@ from marsyard.sim.sensor import (
     preset,
 )
 from marsyard.sim.sensor.imu import IMUS, ImuClass
+from marsyard.sim.sensor.instrument import MAX_TAG_DEVIATIONS
 from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters, site
 
 #: Number of images of an MER descent. Estimators that do not process a stream receive this number of images.
 TRIPLE_SIZE = 3
+#: Duration of a simulated descent before the first image, s.
+SIMULATED_LEAD_S = 5.0
+#: Margin of the inertial unit's data: after the start of the motion and after the thrusters' firing, s.
+IMU_MARGIN_S = 0.1
 
 
 class DescentLanderParameters(Parameters):
@@ -190,7 +195,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
-        """Check terrain, binning, selected images, faults and flight.
+        """Check terrain, binning, selected images, faults, clocks and flight.
 
         Terrain and light must come from the same site.
         """
@@ -214,6 +219,15 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         ineffective = [name for name in INSTRUMENT_FAULTS if self.exact_instruments and getattr(self.faults, name)]
         if ineffective:
             raise ValueError(f"faults.{ineffective[0]} has no effect with exact_instruments; allowed: 0")
+        lead_s = SIMULATED_LEAD_S if self.flight is None else self.flight.lead_s
+        navigation_s = lead_s - IMU_MARGIN_S
+        error_s = self.clock.max_error_s + self.imu.clock.max_error_s
+        if error_s > navigation_s and not self.exact_instruments:
+            raise ValueError(
+                f"clock and imu.clock: |offset_s| plus {MAX_TAG_DEVIATIONS:g} standard deviations (offset_sd_s, "
+                f"jitter_sd_s) are {error_s:.3g} s in all; allowed: at most {navigation_s:.3g} s, the navigation "
+                "before the first image"
+            )
         faulty_image = max(self.faults.repeated_image, self.faults.black_image)
         if faulty_image > self.images:
             raise ValueError(f"a fault affects image {faulty_image}, but the descent has only {self.images} images")

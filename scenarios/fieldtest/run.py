@@ -96,10 +96,11 @@ def simulate_run(key: RunKey) -> FieldRun:
     pass_indices = np.repeat(np.arange(len(pass_times)), [times.size for times in pass_times])
     clock = Clock.draw(p.images.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
-    position = gps.measure(flight, times, generator("gps noise")).values
-    solution = _estimate_attitudes(flown, ground, clock, gps)
     # "picture tags" is the name of a random stream: another name would change the random values
-    attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
+    tags = clock.tags(times, generator("picture tags"))
+    position = gps.measure(flight, tags, generator("gps noise"))
+    solution = _estimate_attitudes(flown, ground, clock, gps)
+    attitudes = solution.attitude(tags)
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
     interpolation = generator("elevation interpolation").standard_normal(len(horizontal))
@@ -129,7 +130,7 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
     for start, end in flight.fly_overs_s:
         times = np.linspace(start, end, p.targets.images + 2)[1:-1]
         tags = clock.tags(times, noise)
-        fixes = gps.measure(flight, times, noise).values
+        fixes = gps.measure(flight, tags, noise)
         if p.targets.sightings == "rendered":
             centroids = render_and_detect_targets(run, ground, targets, times, fixes)
         else:

@@ -20,14 +20,10 @@ from marsyard.sim.sensor.helicopter_navigation import (
     NavigationSolution,
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
-from marsyard.sim.sensor.instrument import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import MAX_TAG_DEVIATIONS, Clock, ClockParameters
 from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
-
-#: Maximum error of a time tag in standard deviations, which 2e-9 of the tags exceed: the filter runs until `TAIL_S`
-#: after the last image.
-MAX_TAG_DEVIATIONS = 6.0
 
 
 class LandingHelicopterParameters(Parameters):
@@ -54,9 +50,8 @@ class LandingHelicopterParameters(Parameters):
 
     @model_validator(mode="after")
     def _check_image_clock(self) -> LandingHelicopterParameters:
-        clock = self.image_clock
-        error_s = abs(clock.offset_s) + MAX_TAG_DEVIATIONS * float(np.hypot(clock.offset_sd_s, clock.jitter_sd_s))
-        if error_s > rotorcraft.TAIL_S:
+        # the filter runs until `TAIL_S` after the last image
+        if (error_s := self.image_clock.max_error_s) > rotorcraft.TAIL_S:
             raise ValueError(
                 f"image_clock: |offset_s| plus {MAX_TAG_DEVIATIONS:g} standard deviations (offset_sd_s, jitter_sd_s) "
                 f"is {error_s:.3g} s; allowed: at most {rotorcraft.TAIL_S:g} s, the flight after the last image"

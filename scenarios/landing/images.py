@@ -23,7 +23,7 @@ from marsyard.sim.streams import Streams
 class Pair:
     """The two images of a landing case, and their rendered frames."""
 
-    images: tuple[DetectorImage, DetectorImage]  #: delivered images with the true camera
+    images: tuple[DetectorImage, DetectorImage]  #: delivered images with the true camera and time
     frames: tuple[Frame, Frame]  #: rendered radiance and ground truth
 
     @property

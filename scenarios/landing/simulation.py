@@ -38,7 +38,7 @@ class RenderedFlight:
 
 
 def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, streams: Streams) -> LandingMeasurements:
-    """Simulate the measurements of a case.
+    """Simulate the measurements of a case; the time tag of an image is that of its pose.
 
     The a-priori site is the point on the first optical axis at the measured range, or at the commanded height if there
     is no range.
@@ -48,7 +48,9 @@ def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, str
     slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
     camera = p.detector.delivered_camera(calibrated)
-    first, second = (replace(image, camera=camera) for image in pair.images)
+    first, second = (
+        replace(image, camera=camera, time_s=pose.time_s) for image, pose in zip(pair.images, flight.poses, strict=True)
+    )
     camera_to_site_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
         images=(first, second),

@@ -41,7 +41,6 @@ _Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 class RangingParameters(Parameters):
     """Parameters of a ranging instrument; errors are standard deviations."""
 
-    rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
     scale_error: Annotated[
         RangeFraction, ALTITUDE, Field(description="constant scale error, fraction of the range")
     ] = 0.0
@@ -53,7 +52,6 @@ class RangingParameters(Parameters):
     boresight_deg: Annotated[
         _Degrees, ALTITUDE, Field(description="SD per axis of the constant pointing error, deg")
     ] = 0.0
-    clock: ClockParameters = ClockParameters()
 
     @model_validator(mode="after")
     def _check_range_limits(self) -> RangingParameters:
@@ -64,16 +62,17 @@ class RangingParameters(Parameters):
 
 
 class LaserParameters(RangingParameters):
-    """Parameters of a laser altimeter. Defaults: a surveying laser on a small helicopter, assumed."""
+    """Parameters of a laser altimeter. Defaults: a surveying laser on a small helicopter, assumed.
 
-    rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 50.0
+    The laser is read at the true times of its use: at the images, and at each step of a landing.
+    """
+
     noise_m: Annotated[RangeDeviation, ALTITUDE, Field(description="noise per reading, independent of range, m")] = 0.05
     count_m: Annotated[RangeDeviation, Field(description="resolution, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
     boresight_deg: Annotated[
         _Degrees, ALTITUDE, Field(description="SD per axis of the constant pointing error, deg")
     ] = 0.1
-    clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,9 @@ class RangingUnit:
     def draw(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
         """Draw the constant errors."""
         p = parameters
-        sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
+        # another number of draws would change the random values of a laser
+        rate_hz, errors = (p.rate_hz, p.clock) if isinstance(p, RadarParameters) else (1.0, ClockParameters())
+        sampling, clock = Sampling.draw(rate_hz, rng), Clock.draw(errors, rng)
         scale = 1.0 + p.scale_error * float(rng.standard_normal())
         tilt = np.radians(p.boresight_deg) * np.append(rng.standard_normal(2), 0.0)
         return cls(p, sampling, clock, scale, np.asarray(Rotation.from_rotvec(tilt).apply(DOWN)))
@@ -143,6 +144,7 @@ class RadarParameters(RangingParameters):
     deviations, its split into a constant error and noise, beam, rate, rounding and time tags.
     """
 
+    rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
     sidelobe_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width with the side lobes, deg")] = 120.0
     sidelobe_fraction: Annotated[

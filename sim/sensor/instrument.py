@@ -17,6 +17,8 @@ from marsyard.sim.parameters import Parameters
 
 #: Knots per correlation time. Linear interpolation between knots reduces the variance by at most 1 %.
 KNOTS_PER_CORRELATION = 50
+#: Maximum error of a time tag in standard deviations: 2e-9 of the tags have a larger one.
+MAX_TAG_DEVIATIONS = 6.0
 _Deviation = Annotated[float, Field(ge=0.0, le=10.0)]
 Times = Float64[np.ndarray, "n"]  #: One time per row, seconds.
 Vector = Float64[np.ndarray, "3"]
@@ -25,14 +27,10 @@ Vectors = Float64[np.ndarray, "n 3"]  #: One vector per row.
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of an instrument with time tags.
-
-    `values` has one row per reading: a range (altimeters, metres) or a position (receivers, metres, world axes). NaN
-    marks a missing reading.
-    """
+    """Ranges of an altimeter, metres, with time tags; NaN marks a missing reading."""
 
     times_s: Times
-    values: Float64[np.ndarray, "n *quantity"]
+    values: Float64[np.ndarray, "n"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +62,11 @@ class ClockParameters(Parameters):
     offset_s: Annotated[float, TIME_TAGS, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
     offset_sd_s: Annotated[_Deviation, TIME_TAGS, Field(description="sd of the constant offset between units, s")] = 0.0
     jitter_sd_s: Annotated[_Deviation, TIME_TAGS, Field(description="sd of the random part of each tag, s")] = 0.0
+
+    @property
+    def max_error_s(self) -> float:
+        """Largest error of a time tag, with `MAX_TAG_DEVIATIONS` standard deviations, s."""
+        return abs(self.offset_s) + MAX_TAG_DEVIATIONS * float(np.hypot(self.offset_sd_s, self.jitter_sd_s))
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.flight import IMU_MARGIN_S, SIMULATED_LEAD_S
 from marsyard.scenarios.descent.images import camera_optics
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import IMU_MARGIN_S, SIMULATED_LEAD_S, DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.fieldtest.flight import field_camera
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
@@ -163,7 +162,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
 @pytest.mark.parametrize("helicopter", [None, {}])
 @pytest.mark.parametrize("case", CASES)
 def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
-    """Time tags are not compared: they are exact, because the pose errors include the clock error."""
+    """Poses that the parameters define have exact time tags; those of a helicopter have the tags of its clock."""
     parameters = LandingScenarioParameters.model_validate(
         {
             "site": "heli-benign",
@@ -181,6 +180,9 @@ def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] 
     for image, pose, state in zip(inputs.images, inputs.poses, truth.states, strict=True):
         assert_cameras_differ("camera", image.camera, parameters.detector.delivered_camera(parameters.optics))
         assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
+        assert image.time_s == pose.time_s
+        if helicopter is not None:
+            assert_differs("time tag", image.time_s, state.time_s)
     first_state, range_m = truth.states[0], float(row["range_m"])
     assert_differs("slant range", inputs.slant_range_m, range_m)
     assert_differs("vertical", inputs.up_body, first_state.attitude.inv().apply([0.0, 0.0, 1.0]))

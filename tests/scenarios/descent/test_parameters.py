@@ -30,6 +30,8 @@ SITES = ("gusev", "ivanpah")
         ({"algorithm": "marsyard.algorithms.dimes:Nothing"}, "cannot import algorithm"),
         ({"dimes": {"templates": 3}}, "templates"),
         ({"faults": {"hase": 1.0}}, "hase"),
+        ({"clock": {"offset_s": -6.0}}, r"clock: .* 6.01 s in all; allowed: at most 4.9 s"),
+        ({"imu": {"clock": {"offset_sd_s": 1.0}}}, "allowed: at most 4.9 s"),
         ({"faults": {"altitude_error": 0.1}, "exact_instruments": True}, "altitude_error has no effect with exact"),
     ],
 )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.sensor.gps import Gps, GpsParameters
+from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver, RtkSolutions
 from tests.sim.sensor.motions import Swaying
 
@@ -89,7 +90,20 @@ def test_receiver_errors_have_the_specified_deviations() -> None:
     for seed in range(200):
         rng = np.random.default_rng(seed)
         gps = Gps.draw(RECEIVER, (0.0, 10.0), rng)
-        errors.append(gps.measure(descent, time, rng).values[0] - true_position)
+        errors.append(gps.measure(descent, time, rng)[0] - true_position)
     # The standard errors from 400 and 200 values are 3.5 % and 5 %; the tolerance is three times that.
     assert np.std(np.array(errors)[:, :2]) == pytest.approx(np.hypot(0.01, 0.01), rel=0.11)
     assert np.std(np.array(errors)[:, 2]) == pytest.approx(np.hypot(0.015, 0.02), rel=0.15)
+
+
+def test_clock_error_displaces_positions_along_the_motion() -> None:
+    """A clock that is 1 s fast gives an event the tag of a position 1 s earlier: 10 m to the west, 75 m higher."""
+    descent = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
+    positions = []
+    for offset_s in (0.0, 1.0):
+        parameters = RECEIVER.model_copy(update={"clock": ClockParameters(offset_s=offset_s)})
+        rng = np.random.default_rng(0)
+        gps = Gps.draw(parameters, (0.0, 10.0), rng)
+        positions.append(gps.measure(descent, np.array([2.0]), rng)[0])
+    # The time-correlated error of 1 and 2 cm changes by a few millimetres in 1 s.
+    np.testing.assert_allclose(positions[1] - positions[0], [-10.0, 0.0, 75.0], atol=0.02)

@@ -1,6 +1,4 @@
-"""Tests of radar and laser altimeter, and of errors and time tags that the GPS receiver shares with the radar."""
-
-from collections.abc import Callable
+"""Tests of radar and laser altimeter."""
 
 import numpy as np
 import pytest
@@ -9,8 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.sensor import (
     ClockParameters,
-    Gps,
-    GpsParameters,
     LaserParameters,
     RadarAltimeter,
     RadarParameters,
@@ -48,46 +44,29 @@ def _make_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray
     return np.array([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), -np.cos(tilt)])
 
 
-Instrument = RadarAltimeter | Gps
 FLAT = flat_ground(64, SPACING)
+NO_ERRORS: dict[str, object] = {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": ClockParameters()}
 
 
-def _make_radar(rng: np.random.Generator, **errors: object) -> Instrument:
+def _make_radar(rng: np.random.Generator, **errors: object) -> RadarAltimeter:
     return RadarAltimeter.draw(RadarParameters.model_validate(errors), FLAT, rng)
 
 
-def _make_gps(rng: np.random.Generator, **errors: object) -> Instrument:
-    return Gps.draw(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
-
-
-NO_ERRORS: dict[Callable[..., Instrument], dict[str, object]] = {
-    _make_radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": ClockParameters()},
-    _make_gps: dict.fromkeys(
-        ("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0
-    ),
-}
-with_each_instrument = pytest.mark.parametrize("make", NO_ERRORS, ids=["radar", "gps"])
-
-
-@with_each_instrument
-def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) -> None:
-    instrument = make(np.random.default_rng(0), **NO_ERRORS[make])
-    times = instrument.sampling.within(0.0, 10.0)
-    readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
-    truth = DESCENT.motion(times).positions_m
+def test_error_free_readings_equal_the_truth() -> None:
+    radar = _make_radar(np.random.default_rng(0), **NO_ERRORS)
+    times = radar.sampling.within(0.0, 10.0)
+    readings = radar.measure(DESCENT, times, np.random.default_rng(1))
     # Flat ground at height 0.
-    np.testing.assert_allclose(readings.values, truth if readings.values.ndim == 2 else truth[:, 2], atol=1e-6)
+    np.testing.assert_allclose(readings.values, DESCENT.motion(times).positions_m[:, 2], atol=1e-6)
     np.testing.assert_array_equal(readings.times_s, times)
 
 
-@with_each_instrument
-def test_readings_are_measured_at_the_true_time(make: Callable[..., Instrument]) -> None:
+def test_readings_are_measured_at_the_true_time() -> None:
     clock = ClockParameters(offset_s=0.02, jitter_sd_s=0.001)
-    instrument = make(np.random.default_rng(0), **NO_ERRORS[make] | {"clock": clock})
+    radar = _make_radar(np.random.default_rng(0), **NO_ERRORS | {"clock": clock})
     times = np.arange(400) * 0.02
-    readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
-    heights = readings.values[:, 2] if readings.values.ndim == 2 else readings.values
-    np.testing.assert_allclose(heights, 2000.0 - 75.0 * times, atol=1e-6)
+    readings = radar.measure(DESCENT, times, np.random.default_rng(1))
+    np.testing.assert_allclose(readings.values, 2000.0 - 75.0 * times, atol=1e-6)
     error = readings.times_s - times
     # The standard errors from 400 values are 5e-5 s of the mean and 3.5 % of the standard deviation.
     assert error.mean() == pytest.approx(0.02, abs=2e-4)
@@ -212,7 +191,7 @@ def test_laser_measures_slant_range_along_its_axis() -> None:
 
 
 def test_laser_has_no_reading_outside_its_range() -> None:
-    no_errors = LaserParameters(noise_m=0.0, count_m=0.0, clock=ClockParameters())
+    no_errors = LaserParameters(noise_m=0.0, count_m=0.0)
     unit = RangingUnit.draw(no_errors, np.random.default_rng(0))
     readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
