@@ -21,7 +21,7 @@ class TerrainParameters(Parameters):
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
     hurst: Annotated[float, Field(gt=0.0, lt=1.0, description="Hurst exponent of the fractal ground's heights")] = 0.8
     rms_slope_deg: Annotated[
-        float, bounded_field(0.0, 30.0, "RMS slope of the ground over the slope baseline, deg")
+        float, bounded_field(0.0, 30.0, "RMS slope of the fractal ground over its baseline, without landforms, deg")
     ] = 2.0
     slope_baseline_m: Annotated[Positive, Field(description="baseline of the RMS slope, m")] = 30.0
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
