@@ -23,7 +23,7 @@ _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
 #: Sides of the bottom of the frustum that hides the sky, as a fraction of those of a rectangle around the wheels. Ray
 #: casting of all parts (`benchmarks.validation.sky_checks`) asks for less, the dark shadows of flown rovers for more.
-_SHELTER_BOTTOM = 0.9
+_SHELTER_BOTTOM = 0.95
 #: Left half of the deck's outline from front to rear, x and y as fractions of half its length and width: the solar
 #: panels of MER, with gaps between them (read from drawings of the press kit, accurate to about 5 %).
 _OUTLINE = (
