@@ -81,14 +81,12 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     made_sections = [robustness, *(maker(subject) for maker in makers)]
     extra_sections = [section for section in made_sections if section is not None]
     report = build_report(evaluation, subject, extra_sections)
-    algorithms = read_algorithms(run.record)
     write_atomic(
         directory / REPORT_JSON,
         hide_folders(json.dumps(report.to_json(), indent=2, allow_nan=False, ensure_ascii=False)) + "\n",
     )
-    rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
-    write_atomic(directory / VERIFICATION_FILE, hide_folders(verification_csv(rows)))
-    write_atomic(directory / JUNIT_FILE, hide_folders(junit_xml(run.name, verdicts, overall_verdict, algorithms)))
+    for name, text in format_verdict_files(evaluation).items():
+        write_atomic(directory / name, text)
     page_file = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context |= {"evidence": evaluation.evidence, "study_sentences": study_sentences(run.record)}
@@ -101,6 +99,14 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     with suppress(StoreError, RuntimeError):  # without a key or a home folder
         sign_report(directory, run.directory)
     return page_file
+
+
+def format_verdict_files(evaluation: Evaluation) -> dict[str, str]:
+    """Format the verdicts for other programs: the traceability matrix and the JUnit results, by the names of files."""
+    run, algorithms = evaluation.run, read_algorithms(evaluation.run.record)
+    rows = requirement_evidence(run.name, evaluation.verdicts, algorithms, evaluation.evidence.title)
+    junit = junit_xml(run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms)
+    return {VERIFICATION_FILE: hide_folders(verification_csv(rows)), JUNIT_FILE: hide_folders(junit)}
 
 
 def create_subject(evaluation: Evaluation) -> Subject:

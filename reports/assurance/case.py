@@ -249,8 +249,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
         )
         text = f"Confirmations of claim {evidence.claim[:8]}: {entries}. Record with head {run.record_head[:12]}"
         solution = Element(ElementKind.SOLUTION, text, evidence=run.file("confirmations.jsonl"))
-    qualifications = [] if run.confirmations else [evidence.text]
-    qualifications += evidence.notes if run.confirmations else []
+    qualifications = (*evidence.terrain_texts, *evidence.notes) if run.confirmations else (evidence.text,)
     runs = table(run.definition.get("calibration")).get("runs") or ()
     calibrated = "; ".join(f"{', '.join(item['options'])} on seed {item['seed']} ({item['note']})" for item in runs)
     return goal(

@@ -149,6 +149,30 @@ def test_package_verifies(package: Path) -> None:
             edit_json("report.json", lambda report: report["robustness"][0].update(passes_at=20.0)),
             f"{RUN}/report.json: robustness does not follow from the rows",
         ),
+        (
+            edit_json("report.json", lambda report: report.update(verdict="PASS", exit_code=0)),
+            f"{RUN}/report.json: verdict does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report["evidence"].update(kind="confirmation")),
+            f"{RUN}/report.json: evidence does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report["verdicts"][0].update(all_cases=None, consumer_risk=0.0)),
+            f"{RUN}/report.json: verdicts does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report.update(git_commit="abc")),
+            f"{RUN}/report.json: git_commit does not follow from the rows",
+        ),
+        (
+            edit_text(f"{RUN}/verification.csv", "PASS (exploration)", "PASS"),
+            f"{RUN}/verification.csv: the content does not follow",
+        ),
+        (
+            edit_text(f"{RUN}/junit.xml", "PASS (exploration)", "PASS"),
+            f"{RUN}/junit.xml: the content does not follow",
+        ),
         (edit_text(ARGUMENT, "supported, with open defeaters", "supported"), "case.json: element G"),
         (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
