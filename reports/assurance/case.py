@@ -47,7 +47,7 @@ class AssuredRun:
     - folder: folder in the package, relative to it
     - report, data: content of `report.json`, read, and as JSON
     - record: content of `campaign.json`
-    - head, identity: last head of the chain of hashes of the rows, and the hash of the definition in its first one
+    - head: last head of the chain of hashes of the rows
     - confirmations, record_head: entries of the claim in its record of confirmations, and the hash of the record
     """
 
@@ -56,7 +56,6 @@ class AssuredRun:
     data: Mapping[str, Any]
     record: Mapping[str, Any]
     head: str
-    identity: str
     confirmations: Sequence[Confirmation] = ()
     record_head: str = ""
 

@@ -121,11 +121,11 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
     if report is None:
         raise StoreError(f"{directory / REPORT_JSON} is damaged, or of another version")
     with readable_store(directory / ROWS_FILE) as store:
-        head, identity = store.head, store.about.get("identity", "")
+        head = store.head
     confirmations = read_record(directory / CONFIRMATIONS)
     entries = confirmations.of_claim(report.evidence.claim) if report.evidence.claim else []
     record_head = confirmations.head if entries else ""
-    return AssuredRun(name, report, data, record, head, identity, entries, record_head)
+    return AssuredRun(name, report, data, record, head, entries, record_head)
 
 
 def render_argument(argument: AssuranceCase) -> Mapping[str, str]:
