@@ -72,7 +72,8 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     """Write the report of an evaluated campaign into the folder `out`, and sign it; None for the campaign's folder.
 
-    Returns the path of the page. The signature is omitted without a key; the dashboard then writes the report again.
+    Returns the path of the page. The signature is omitted without a key, and for other requirements than those of the
+    campaign; the dashboard then writes the report again.
     """
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
     directory, subject = run.directory if out is None else out, create_subject(evaluation)
@@ -96,8 +97,10 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     for row in context["verdicts"]:
         row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
-    with suppress(StoreError, RuntimeError):  # without a key or a home folder
-        sign_report(directory, run.directory)
+    # the dashboard shows verdicts on the requirements of the campaign only
+    if run.requirements == run.definition.get("requirements", run.requirements):
+        with suppress(StoreError, RuntimeError):  # without a key or a home folder
+            sign_report(directory, run.directory)
     return page_file
 
 
@@ -105,7 +108,10 @@ def format_verdict_files(evaluation: Evaluation) -> dict[str, str]:
     """Format the verdicts for other programs: the traceability matrix and the JUnit results, by the names of files."""
     run, algorithms = evaluation.run, read_algorithms(evaluation.run.record)
     rows = requirement_evidence(run.name, evaluation.verdicts, algorithms, evaluation.evidence.title)
-    junit = junit_xml(run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms)
+    is_finished = run.recorded("state") in (None, "finished")
+    junit = junit_xml(
+        run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms, is_finished=is_finished
+    )
     return {VERIFICATION_FILE: hide_folders(verification_csv(rows)), JUNIT_FILE: hide_folders(junit)}
 
 
