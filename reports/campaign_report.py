@@ -109,9 +109,7 @@ def format_verdict_files(evaluation: Evaluation) -> dict[str, str]:
     run, algorithms = evaluation.run, read_algorithms(evaluation.run.record)
     rows = requirement_evidence(run.name, evaluation.verdicts, algorithms, evaluation.evidence.title)
     is_finished = run.recorded("state") in (None, "finished")
-    junit = junit_xml(
-        run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms, is_finished=is_finished
-    )
+    junit = junit_xml(run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms, is_finished=is_finished)
     return {VERIFICATION_FILE: hide_folders(verification_csv(rows)), JUNIT_FILE: hide_folders(junit)}
 
 

@@ -201,9 +201,7 @@ def _adopt_registration(evaluation: Evaluation, report: CampaignReport) -> Evalu
     ]
     overall = combine_verdicts(verdicts, evaluation.run.all_cases, evaluation.sampling, evidence)
     is_qualified = report.exit_code == QUALIFIED_EXIT_CODE
-    return replace(
-        evaluation, evidence=evidence, verdicts=verdicts, overall_verdict=overall, is_qualified=is_qualified
-    )
+    return replace(evaluation, evidence=evidence, verdicts=verdicts, overall_verdict=overall, is_qualified=is_qualified)
 
 
 def _compare_report(run: AssuredRun, evaluation: Evaluation, directory: Path) -> Iterator[str]:

@@ -105,9 +105,7 @@ def test_changed_shard_is_rejected(shards: list[Path], tmp_path: Path) -> None:
     assert not (tmp_path / "merged").exists()
 
 
-def test_rows_of_another_campaign_are_rejected(
-    shards: list[Path], campaign_file: CampaignFile, tmp_path: Path
-) -> None:
+def test_rows_of_another_campaign_are_rejected(shards: list[Path], campaign_file: CampaignFile, tmp_path: Path) -> None:
     (other,) = _run_shards(campaign_file("unanswered_cases = [2]"), tmp_path, 1)
     shutil.copy(shards[0] / "campaign.json", other / "campaign.json")
     with pytest.raises(CampaignError, match="the definition is not the one with which the rows were stored"):

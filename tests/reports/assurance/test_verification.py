@@ -169,10 +169,7 @@ def test_package_verifies(package: Path) -> None:
             edit_text(f"{RUN}/verification.csv", "PASS (exploration)", "PASS"),
             f"{RUN}/verification.csv: the content does not follow",
         ),
-        (
-            edit_text(f"{RUN}/junit.xml", "PASS (exploration)", "PASS"),
-            f"{RUN}/junit.xml: the content does not follow",
-        ),
+        (edit_text(f"{RUN}/junit.xml", "PASS (exploration)", "PASS"), f"{RUN}/junit.xml: the content does not follow"),
         (edit_text(ARGUMENT, "supported, with open defeaters", "supported"), "case.json: element G"),
         (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
