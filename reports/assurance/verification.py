@@ -6,6 +6,7 @@ The other steps then still find rows, records and claims that contradict each ot
 
 import json
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,6 +43,8 @@ _NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "est
 _TEXTS = ("statement", "metric", "population", "decide_by", "source", "kind")
 #: Relative difference of equal numbers: rounding errors of another processor.
 _TOLERANCE = 1e-9
+#: Folders of the author that texts hide (`hide_folders`), and their names in a regular expression.
+_HIDDEN_FOLDER, _GROUPS = re.compile(r"(~|\$MARSYARD_CACHE)"), {"~": "home", "$MARSYARD_CACHE": "cache"}
 #: Content of `report.json` that is verified by its hash only: data of the page's sections, and cases with images.
 _BY_HASH_ONLY = ("sections", "showcases")
 
@@ -213,7 +216,7 @@ def _compare_report(run: AssuredRun, evaluation: Evaluation, directory: Path) ->
     stated = replace(evaluation, verdicts=run.report.verdicts)
     for name, text in format_verdict_files(stated).items():
         path = directory / name
-        if path.is_file() and path.read_text(encoding="utf-8") != text:
+        if path.is_file() and not _is_same_text(path.read_text(encoding="utf-8"), text):
             yield f"{run.folder}/{name}: the content does not follow from report.json"
 
 
@@ -238,7 +241,29 @@ def _is_equal(first: Any, second: Any) -> bool:
         return len(first) == len(second) and all(map(_is_equal, first, second))
     if isinstance(first, float) and isinstance(second, float):
         return math.isclose(first, second, rel_tol=_TOLERANCE)
+    if isinstance(first, str) and isinstance(second, str):
+        return _is_same_text(first, second)
     return bool(first == second)
+
+
+def _is_same_text(first: str, second: str) -> bool:
+    """Compare texts, of which one can name a folder that the other one hides."""
+    if first == second:
+        return True
+    return any(re.fullmatch(_create_pattern(a), b) is not None for a, b in ((first, second), (second, first)))
+
+
+def _create_pattern(text: str) -> str:
+    """Create a regular expression for a text with named folders in place of hidden ones, each one folder everywhere."""
+    pattern, groups = "", set()
+    for part in _HIDDEN_FOLDER.split(text):
+        group = _GROUPS.get(part)
+        if group is None:
+            pattern += re.escape(part)
+        else:
+            pattern += f"(?P={group})" if group in groups else rf"(?P<{group}>/[^\s\"',;]*)"
+            groups.add(group)
+    return pattern
 
 
 def _compare_argument(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:

@@ -349,6 +349,22 @@ def test_report_of_another_layout_is_checked_by_its_rows_and_hashes(package: Pat
     assert "the row of case 7 was changed" in " ".join(verify_package(package).problems)
 
 
+def test_package_verifies_in_another_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report hides the home folder of its author in the path of a program, the record does not."""
+    program = "/home/author/estimator"
+    algorithm = {"spec": f"exec:{program} --fast", "role": "tested", "path": program, "options": {}}
+    run = write_stored_run(tmp_path / "run", cases=20, algorithms=[algorithm])
+    monkeypatch.setenv("HOME", "/home/author")
+    (tmp_path / "package").mkdir()
+    write_package([run], tmp_path / "package")
+    monkeypatch.setenv("HOME", "/home/reader")
+    assert verify_package(tmp_path / "package").problems == ()
+    change = edit_json("report.json", lambda report: report["algorithm_details"][0].update(name="exec:~/other --fast"))
+    change(tmp_path / "package")
+    rehash(tmp_path / "package")
+    assert any("algorithm_details" in problem for problem in verify_package(tmp_path / "package").problems)
+
+
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
     manifest = json.loads((package / MANIFEST).read_text())
     (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9", "program": "0"}))
