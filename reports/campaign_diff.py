@@ -71,7 +71,9 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[M
 
 def have_same_draws(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal case numbers are the same case in both campaigns."""
-    keys = ("name", "scenario", "seed", "dispersions", "design")
+    keys = ["name", "scenario", "seed", "dispersions", "design"]
+    if table(first.recorded("design")).get("kind", "random") != "random":
+        keys += ["cases", "appended"]  # the draws of a stratified design depend on the sizes of its blocks
     return _bank_seeds(first) == _bank_seeds(second) and all(
         first.recorded(key) == second.recorded(key) for key in keys
     )

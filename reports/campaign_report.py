@@ -72,7 +72,8 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     """Write the report of an evaluated campaign into the folder `out`, and sign it; None for the campaign's folder.
 
-    Returns the path of the page. The signature is omitted without a key; the dashboard then writes the report again.
+    Returns the path of the page. The signature is omitted without a key, and for other requirements than those of the
+    campaign; the dashboard then writes the report again.
     """
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
     directory, subject = run.directory if out is None else out, create_subject(evaluation)
@@ -81,14 +82,12 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     made_sections = [robustness, *(maker(subject) for maker in makers)]
     extra_sections = [section for section in made_sections if section is not None]
     report = build_report(evaluation, subject, extra_sections)
-    algorithms = read_algorithms(run.record)
     write_atomic(
         directory / REPORT_JSON,
         hide_folders(json.dumps(report.to_json(), indent=2, allow_nan=False, ensure_ascii=False)) + "\n",
     )
-    rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
-    write_atomic(directory / VERIFICATION_FILE, hide_folders(verification_csv(rows)))
-    write_atomic(directory / JUNIT_FILE, hide_folders(junit_xml(run.name, verdicts, overall_verdict, algorithms)))
+    for name, text in format_verdict_files(evaluation).items():
+        write_atomic(directory / name, text)
     page_file = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context |= {"evidence": evaluation.evidence, "study_sentences": study_sentences(run.record)}
@@ -98,9 +97,20 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     for row in context["verdicts"]:
         row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
-    with suppress(StoreError, RuntimeError):  # without a key or a home folder
-        sign_report(directory, run.directory)
+    # the dashboard shows verdicts on the requirements of the campaign only
+    if run.requirements == run.definition.get("requirements", run.requirements):
+        with suppress(StoreError, RuntimeError):  # without a key or a home folder
+            sign_report(directory, run.directory)
     return page_file
+
+
+def format_verdict_files(evaluation: Evaluation) -> dict[str, str]:
+    """Format the verdicts for other programs: the traceability matrix and the JUnit results, by the names of files."""
+    run, algorithms = evaluation.run, read_algorithms(evaluation.run.record)
+    rows = requirement_evidence(run.name, evaluation.verdicts, algorithms, evaluation.evidence.title)
+    is_finished = run.recorded("state") in (None, "finished")
+    junit = junit_xml(run.name, evaluation.verdicts, evaluation.overall_verdict, algorithms, is_finished=is_finished)
+    return {VERIFICATION_FILE: hide_folders(verification_csv(rows)), JUNIT_FILE: hide_folders(junit)}
 
 
 def create_subject(evaluation: Evaluation) -> Subject:

@@ -144,10 +144,13 @@ def _mark_unverified(verdict: Verdict, run: StoredRun) -> Verdict:
 def _describe_wrong_rows(run: StoredRun) -> str:
     """Describe that the rows are not one for each case of a finished campaign; empty if they are."""
     numbers = run.all_cases["case"].tolist() if "case" in run.all_cases else []
-    cases = int(run.record.get("cases") or len(numbers))
-    if sorted(numbers) == list(range(cases)):
-        return ""
-    return f"The rows are not those of {count(cases, 'case')}: a verdict needs one row for each case from 0."
+    recorded = int(run.record.get("cases") or len(numbers))
+    # the bounds depend on the blocks of cases, each of which was evaluated
+    blocks = [run.definition.get("cases", recorded), *(run.definition.get("appended") or ())]
+    for cases in (recorded, sum(blocks)):
+        if sorted(numbers) != list(range(cases)):
+            return f"The rows are not those of {count(cases, 'case')}: a verdict needs one row for each case from 0."
+    return ""
 
 
 def _qualify(

@@ -94,7 +94,7 @@ class CampaignReport:
         values["verdicts"] = [asdict(verdict) | _properties(verdict, _VERDICT_PROPERTIES) for verdict in self.verdicts]
         values["robustness"] = [asdict(item) | _properties(item, _ROBUSTNESS_PROPERTIES) for item in self.robustness]
         values["sampling"] |= _properties(self.sampling, _SAMPLING_PROPERTIES)
-        values["evidence"] = self.evidence.to_table() | _properties(self.evidence, _EVIDENCE_PROPERTIES)
+        values["evidence"] |= _properties(self.evidence, _EVIDENCE_PROPERTIES)
         return dict(_to_json_types(values))
 
 

@@ -84,12 +84,18 @@ _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff
 
 
 def junit_xml(
-    campaign: str, verdicts: Sequence[Verdict], overall: OverallVerdict, algorithms: Sequence[Algorithm] = ()
+    campaign: str,
+    verdicts: Sequence[Verdict],
+    overall: OverallVerdict,
+    algorithms: Sequence[Algorithm] = (),
+    *,
+    is_finished: bool = True,
 ) -> str:
     """Format the verdicts as JUnit XML: a test for each requirement, and one for the completion of all cases.
 
     FAIL is a failure; INSUFFICIENT, MET BY RATE and PASS with a qualification are skipped; PASS of an exploration is
     named in the output of its test. Properties of the suite: the tested algorithm.
+    is_finished: whether all cases have run; otherwise the test for their completion is skipped
     """
     statuses = [verdict.status for verdict in verdicts]
     suite = Xml.Element(
@@ -97,7 +103,10 @@ def junit_xml(
         name=_clean_xml(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
-        skipped=str(sum(status not in (Status.PASS, Status.FAIL) for status in statuses)),
+        skipped=str(
+            sum(status not in (Status.PASS, Status.FAIL) for status in statuses)
+            + (not is_finished and not overall.crashed)
+        ),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
     if cells:
@@ -124,6 +133,8 @@ def junit_xml(
     completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")
     if overall.crashed:
         Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")
+    elif not is_finished:
+        Xml.SubElement(completion, "skipped", message="INSUFFICIENT: the campaign is not finished")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
 

@@ -130,13 +130,14 @@ class Evidence:
             "program; PASS needs a new run.",
             EvidenceKind.CHANGED: f"Not the frozen evaluation: {changes}. PASS needs a run with --confirm.",
         }[self.kind]
-        return " ".join((text, *self._terrain_texts(), *self.notes))
+        return " ".join((text, *self.terrain_texts, *self.notes))
 
-    def _terrain_texts(self) -> list[str]:
-        """Describe the terrains that the cases share with calibration runs or with all confirmations."""
+    @property
+    def terrain_texts(self) -> tuple[str, ...]:
+        """The terrains that the cases share with calibration runs or with all confirmations, in sentences."""
         texts: list[str] = []
         if self.kind is not EvidenceKind.CONFIRMATION:
-            return texts
+            return ()
         if self.imported_terrain:
             texts.append("The terrain is an imported DTM: all confirmations are on the same ground.")
         if self.overlap is None:
@@ -144,7 +145,7 @@ class Evidence:
         elif self.overlap > 0.0:
             limit = f"more than {100.0 * MAX_CALIBRATION_OVERLAP:.0f} % allow no PASS"
             texts.append(f"{100.0 * self.overlap:.0f} % of its cases are on terrains of calibration runs; {limit}.")
-        return texts
+        return tuple(texts)
 
 
 def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:

@@ -172,8 +172,6 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
         )
     check_rows(directory)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
-        if store.about.get("identity") != stored["identity"]["definition"] and not stored["changes"]:
-            raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
         retries = store.list_cases_with_outcomes(RETRYABLE[word] for word in retry)
         table = directory / TABLE_FILE

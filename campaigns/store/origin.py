@@ -12,7 +12,7 @@ from typing import Any
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.components import list_algorithms, list_parts
-from marsyard.campaigns.definition.identity import custom_sources, hash_sources
+from marsyard.campaigns.definition.identity import custom_sources, hash_sources, stored_definition_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.key import is_signature, sign
@@ -43,20 +43,38 @@ def check_origin(directory: Path, definition: CampaignDefinition) -> None:
 def check_rows(directory: Path) -> str:
     """Verify the rows of a campaign; return the reason if there is only their table, otherwise an empty text.
 
-    Raises StoreError if a row was changed after it was stored, or rows of a folder of this user are not signed by it.
+    Raises StoreError if a row was changed after it was stored, the rows are those of another definition, or rows of a
+    folder of this user are not signed by it.
     """
     path = directory / ROWS_FILE
     if not path.exists():
         return f"{directory} has no {ROWS_FILE}"
     with readable_store(path) as store:
         store.verify()
-        is_signed = store.is_signed
+        is_signed, identity = store.is_signed, store.about.get("identity")
+    _check_definition(directory, identity)
     if not is_signed and _is_own_folder(directory):
         raise StoreError(
             f"{path} was written by another user or program than {record.RECORD_FILE}, which you created: its rows may "
             f"not be those of its cases. If you trust them: marsyard report {directory} --trust"
         )
     return ""
+
+
+def _check_definition(directory: Path, identity: str | None) -> None:
+    """Raise StoreError if the definition in the record is not the one with which the rows were stored.
+
+    identity: hash in the first head of the chain. A campaign that was continued with another definition lists this
+    change in its record, and cannot be PASS.
+    """
+    try:
+        stored = record.read(directory)
+    except StoreError:  # rows without a valid record
+        return
+    if identity and identity != stored_definition_hash(stored["definition"]) and not stored["changes"]:
+        raise StoreError(
+            f"{directory / record.RECORD_FILE}: the definition is not the one with which the rows were stored"
+        )
 
 
 def adopt(directory: Path) -> None:

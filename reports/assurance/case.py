@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.claims import Confirmation
+from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.reports.assurance.argument import (
     Element,
     ElementKind,
@@ -24,6 +25,7 @@ from marsyard.reports.assurance.argument import (
     number_elements,
 )
 from marsyard.reports.fits import Constant, read_constants
+from marsyard.reports.overall import describe_status
 from marsyard.reports.provenance import format_tested_algorithms
 from marsyard.reports.report_file import CampaignReport
 from marsyard.reports.stored import table
@@ -47,7 +49,7 @@ class AssuredRun:
     - folder: folder in the package, relative to it
     - report, data: content of `report.json`, read, and as JSON
     - record: content of `campaign.json`
-    - head, identity: last head of the chain of hashes of the rows, and the hash of the definition in its first one
+    - head: last head of the chain of hashes of the rows
     - confirmations, record_head: entries of the claim in its record of confirmations, and the hash of the record
     """
 
@@ -56,7 +58,6 @@ class AssuredRun:
     data: Mapping[str, Any]
     record: Mapping[str, Any]
     head: str
-    identity: str
     confirmations: Sequence[Confirmation] = ()
     record_head: str = ""
 
@@ -87,6 +88,11 @@ class AssuredRun:
         """Paths of the dispersions whose source contains an assumption."""
         dispersions = table(self.definition.get("dispersions"))
         return [str(path) for path, item in dispersions.items() if _ASSUMED in str(table(item).get("source")).lower()]
+
+    def word(self, verdict: Verdict) -> str:
+        """Return the word for a verdict; PASS of an exploration is marked."""
+        is_exploration = self.report.evidence.kind is EvidenceKind.EXPLORATION
+        return describe_status(verdict.status, is_exploration=is_exploration)
 
     def file(self, name: str) -> str:
         """Return the path of a file of the campaign in the package."""
@@ -196,7 +202,7 @@ def _argue_requirement(run: AssuredRun, verdict: Verdict) -> Element:
     """Argue that a requirement is met, with its robustness."""
     required = f"{format_fraction(verdict.probability)} at {format_fraction(verdict.confidence)} confidence"
     bounds = "" if math.isnan(verdict.lower) else f", bounds {percent(verdict.lower)} to {percent(verdict.upper)}"
-    numbers = f"{verdict.status}: {verdict.failures:,} of {count(verdict.n, 'case')} failed{bounds}. {verdict.note}"
+    numbers = f"{run.word(verdict)}: {verdict.failures:,} of {count(verdict.n, 'case')} failed{bounds}. {verdict.note}"
     state = GoalState.SUPPORTED
     if not verdict.status.is_met:
         state = GoalState.REFUTED if verdict.status is Status.FAIL else GoalState.OPEN
@@ -249,8 +255,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
         )
         text = f"Confirmations of claim {evidence.claim[:8]}: {entries}. Record with head {run.record_head[:12]}"
         solution = Element(ElementKind.SOLUTION, text, evidence=run.file("confirmations.jsonl"))
-    qualifications = [] if run.confirmations else [evidence.text]
-    qualifications += evidence.notes if run.confirmations else []
+    qualifications = (*evidence.terrain_texts, *evidence.notes) if run.confirmations else (evidence.text,)
     runs = table(run.definition.get("calibration")).get("runs") or ()
     calibrated = "; ".join(f"{', '.join(item['options'])} on seed {item['seed']} ({item['note']})" for item in runs)
     return goal(

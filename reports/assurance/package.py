@@ -14,7 +14,6 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from marsyard.campaigns.definition.identity import hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.confirmation_record import read_record
@@ -29,7 +28,7 @@ from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.report_file import REPORT_JSON, read_report
-from marsyard.reports.signature import SIGNATURE_FILE
+from marsyard.reports.signature import SIGNATURE_FILE, hash_program
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.validation_rows import VALIDATION_FILE
 
@@ -39,7 +38,6 @@ PAGE, ARGUMENT, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "mani
 SCHEMA = 1
 #: Copy of the record of confirmations in the folder of a campaign.
 CONFIRMATIONS = "confirmations.jsonl"
-_REPORTS_FOLDER = REGISTER_FILE.parent
 _CREDIBILITY_FILE = REGISTER_FILE.with_name("credibility.toml")
 
 
@@ -121,11 +119,11 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
     if report is None:
         raise StoreError(f"{directory / REPORT_JSON} is damaged, or of another version")
     with readable_store(directory / ROWS_FILE) as store:
-        head, identity = store.head, store.about.get("identity", "")
+        head = store.head
     confirmations = read_record(directory / CONFIRMATIONS)
     entries = confirmations.of_claim(report.evidence.claim) if report.evidence.claim else []
     record_head = confirmations.head if entries else ""
-    return AssuredRun(name, report, data, record, head, identity, entries, record_head)
+    return AssuredRun(name, report, data, record, head, entries, record_head)
 
 
 def render_argument(argument: AssuranceCase) -> Mapping[str, str]:
@@ -136,12 +134,6 @@ def render_argument(argument: AssuranceCase) -> Mapping[str, str]:
     context = {"argument": argument, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
     page = page_environment().get_template("assurance.html.j2").render(context)
     return {ARGUMENT: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
-
-
-def hash_program() -> str:
-    """Compute the hash of the program that writes packages: all files of the package `reports`, also its evidence."""
-    files = sorted(path for path in _REPORTS_FOLDER.rglob("*") if path.is_file() and path.suffix != ".pyc")
-    return hash_sources((path.relative_to(_REPORTS_FOLDER).as_posix(), path) for path in files)
 
 
 def hash_files(folder: Path) -> dict[str, str]:

@@ -6,31 +6,34 @@ The other steps then still find rows, records and claims that contradict each ot
 
 import json
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.identity import stored_definition_hash
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.store.confirmation_record import find_own_entry, read_record
+from marsyard.campaigns.store.git_history import UNKNOWN
 from marsyard.reports.assurance.case import AssuredRun, build_argument
 from marsyard.reports.assurance.package import (
     CONFIRMATIONS,
     MANIFEST,
     SCHEMA,
     hash_files,
-    hash_program,
     read_run_evidence,
     render_argument,
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
-from marsyard.reports.campaign_report import build_report, create_subject
+from marsyard.reports.campaign_report import build_report, create_subject, format_verdict_files
 from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.report_file import REPORT_JSON, read_report
+from marsyard.reports.joint import read_joint_evidence
+from marsyard.reports.overall import QUALIFIED_EXIT_CODE, combine_verdicts
+from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.signature import hash_program
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
@@ -40,11 +43,10 @@ _NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "est
 _TEXTS = ("statement", "metric", "population", "decide_by", "source", "kind")
 #: Relative difference of equal numbers: rounding errors of another processor.
 _TOLERANCE = 1e-9
-#: Further content of `report.json` that follows from the rows.
-_FROM_ROWS = (
-    "cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details", "validity",
-    "robustness",
-)  # fmt: skip
+#: Folders of the author that texts hide (`hide_folders`), and their names in a regular expression.
+_HIDDEN_FOLDER, _GROUPS = re.compile(r"(~|\$MARSYARD_CACHE)"), {"~": "home", "$MARSYARD_CACHE": "cache"}
+#: Content of `report.json` that is verified by its hash only: data of the page's sections, and cases with images.
+_BY_HASH_ONLY = ("sections", "showcases")
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
                     notes.append(f"runs/{run_name}: verdicts by their hash only; the report has another layout")
                     continue
                 run = read_run_evidence(copy, f"runs/{run_name}")
-                problems += _verify_run(run, evaluation, record, is_same_program)
+                problems += _verify_run(run, evaluation, directory, is_same_program)
                 runs.append(run)
             except (CampaignError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
                 problems.append(f"runs/{run_name}: {_relative(error, copy)}")
@@ -147,12 +149,10 @@ def _describe_program(manifest: Mapping[str, Any]) -> str:
     return f"written by marsyard {manifest.get('marsyard')} ({str(manifest.get('program'))[:8]}), this is {own}"
 
 
-def _verify_run(run: AssuredRun, evaluation: Evaluation, record: Path, is_same_program: bool) -> Iterator[str]:
-    """Verify that record and verdicts agree with the rows, and for the same program further numbers of the report."""
+def _verify_run(run: AssuredRun, evaluation: Evaluation, directory: Path, is_same_program: bool) -> Iterator[str]:
+    """Verify that record and verdicts agree with the rows, and for the same program all data of the report."""
+    record = directory / CONFIRMATIONS
     evidence = run.report.evidence
-    # the chain of the rows begins with the hash of the definition
-    if run.identity != stored_definition_hash(run.definition):
-        yield f"{run.folder}/campaign.json: the definition is not the one with which the rows were stored"
     for key in ("name", "seed"):
         value, defined = run.record.get(key), run.definition.get(key)
         if value != defined:
@@ -172,10 +172,52 @@ def _verify_run(run: AssuredRun, evaluation: Evaluation, record: Path, is_same_p
             yield f"{run.folder}/report.json: the requirement {name} is missing, or not in campaign.json"
         elif difference := _find_difference(stored[name], computed[name]):
             yield f"{run.folder}/report.json: {name} does not follow from the rows: {difference}"
-    computed_report = build_report(evaluation, create_subject(evaluation), ()).to_json()
-    for key in _FROM_ROWS if is_same_program else ():
-        if not _is_equal(run.data.get(key), computed_report.get(key)):
-            yield f"{run.folder}/report.json: {key} does not follow from the rows"
+    joint = read_joint_evidence(replace(evaluation.evidence, record=str(record)))
+    for name, verdict in stored.items():
+        if verdict.status is Status.PASS and joint.has_unpassed_variant(name):
+            yield f"{run.folder}/report.json: {name} is PASS in spite of other claims in {CONFIRMATIONS}"
+    if is_same_program and stored.keys() == computed.keys():
+        yield from _compare_report(run, _adopt_registration(evaluation, run.report), directory)
+
+
+def _adopt_registration(evaluation: Evaluation, report: CampaignReport) -> Evaluation:
+    """Return an evaluation with what a report states about the registration of the record of confirmations.
+
+    It determines the qualification of PASS and some texts, and cannot be verified without the repository.
+    """
+    statuses = {verdict.requirement_id: verdict.status for verdict in report.verdicts}
+    registration = [note for note in report.evidence.notes if note.startswith(UNKNOWN)]
+    own_notes = [note for note in evaluation.evidence.notes if not note.startswith(UNKNOWN)]
+    evidence = replace(
+        evaluation.evidence,
+        record=report.evidence.record,
+        registration=report.evidence.registration,
+        notes=(*registration, *own_notes),
+    )
+    verdicts = [
+        replace(
+            verdict,
+            status=statuses[verdict.requirement_id],
+            reason=verdict.reason.replace(evaluation.evidence.text, evidence.text),
+        )
+        for verdict in evaluation.verdicts
+    ]
+    overall = combine_verdicts(verdicts, evaluation.run.all_cases, evaluation.sampling, evidence)
+    is_qualified = report.exit_code == QUALIFIED_EXIT_CODE
+    return replace(evaluation, evidence=evidence, verdicts=verdicts, overall_verdict=overall, is_qualified=is_qualified)
+
+
+def _compare_report(run: AssuredRun, evaluation: Evaluation, directory: Path) -> Iterator[str]:
+    """Compare the data of a report, and its files for other programs, with those that follow from the rows."""
+    for key, value in build_report(evaluation, create_subject(evaluation), ()).to_json().items():
+        if key not in _BY_HASH_ONLY and not _is_equal(run.data.get(key), value):
+            yield f"{run.folder}/report.json: {key} does not follow from the rows and campaign.json"
+    # from the stored numbers, which can differ in their last digits
+    stated = replace(evaluation, verdicts=run.report.verdicts)
+    for name, text in format_verdict_files(stated).items():
+        path = directory / name
+        if path.is_file() and not _is_same_text(path.read_text(encoding="utf-8"), text):
+            yield f"{run.folder}/{name}: the content does not follow from report.json"
 
 
 def _find_difference(stored: Verdict, computed: Verdict) -> str:
@@ -199,7 +241,29 @@ def _is_equal(first: Any, second: Any) -> bool:
         return len(first) == len(second) and all(map(_is_equal, first, second))
     if isinstance(first, float) and isinstance(second, float):
         return math.isclose(first, second, rel_tol=_TOLERANCE)
+    if isinstance(first, str) and isinstance(second, str):
+        return _is_same_text(first, second)
     return bool(first == second)
+
+
+def _is_same_text(first: str, second: str) -> bool:
+    """Compare texts, of which one can name a folder that the other one hides."""
+    if first == second:
+        return True
+    return any(re.fullmatch(_create_pattern(a), b) is not None for a, b in ((first, second), (second, first)))
+
+
+def _create_pattern(text: str) -> str:
+    """Create a regular expression for a text with named folders in place of hidden ones, each one folder everywhere."""
+    pattern, groups = "", set()
+    for part in _HIDDEN_FOLDER.split(text):
+        group = _GROUPS.get(part)
+        if group is None:
+            pattern += re.escape(part)
+        else:
+            pattern += f"(?P={group})" if group in groups else rf"(?P<{group}>/[^\s\"',;]*)"
+            groups.add(group)
+    return pattern
 
 
 def _compare_argument(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:

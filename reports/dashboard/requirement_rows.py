@@ -9,10 +9,9 @@ from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.reports.dashboard.entries import Entry
 from marsyard.reports.overall import EXPLORATORY_PASS, describe_status
-from marsyard.reports.robustness import Robustness
 from marsyard.reports.robustness_wording import reach_text
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
-from marsyard.reports.wording import NOTHING, percent
+from marsyard.reports.wording import NOTHING, format_fraction, percent
 
 #: Maximum number of campaigns in a sparkline, and its width and height, pixels.
 _MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
@@ -36,10 +35,11 @@ class Sparkline:
 
 @dataclass(frozen=True)
 class Cell:
-    """Verdict of a campaign on a requirement."""
+    """Verdict of a campaign on a requirement; `changes` describes how the campaign has changed the requirement."""
 
     entry: Entry
     verdict: Verdict
+    changes: str = ""
 
     @property
     def word(self) -> str:
@@ -52,14 +52,21 @@ class Cell:
         """Whether the campaign is a confirmation, which precedes all explorations."""
         return self.entry.report.evidence.is_confirmation
 
+    @property
+    def basis(self) -> str:
+        """What the verdict is based on, and how far it reaches; may be empty."""
+        by_rate = "evaluated by observed rate" if self.verdict.decide_by == ESTIMATE else ""
+        reach = reach_text(self.verdict, self.entry.report.robustness)
+        return "; ".join(filter(None, (self.changes, by_rate, reach)))
+
 
 @dataclass(frozen=True)
 class RequirementRow:
     """A requirement, its latest verdict for each campaign name, and the trend of the first of these campaigns.
 
     - cells: verdict for each campaign name, the first one in the order of `all_cells`
-    - all_cells: verdicts of all campaigns: confirmations, then other campaigns, then unfinished ones, each the latest
-      first
+    - all_cells: verdicts of all campaigns: confirmations, then other campaigns, then campaigns that have changed the
+      requirement, then unfinished ones, each the latest first
     - studies: latest study of each kind and campaign name
     """
 
@@ -83,12 +90,15 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
     cells: dict[str, list[Cell]] = {name: [] for name in shared}
     for entry in entries:
         for verdict in entry.report.verdicts:
-            cells.setdefault(verdict.requirement_id, []).append(Cell(entry, verdict))
+            name = verdict.requirement_id
+            cells.setdefault(name, []).append(Cell(entry, verdict, describe_changes(verdict, shared.get(name))))
         if entry.report.study is not None:
             cells.setdefault(entry.report.study.requirement, [])
     rows = []
     for name, unsorted_cells in cells.items():
-        sorted_cells = sorted(unsorted_cells, key=lambda cell: (not cell.entry.is_finished, not cell.is_confirmation))
+        sorted_cells = sorted(
+            unsorted_cells, key=lambda cell: (not cell.entry.is_finished, bool(cell.changes), not cell.is_confirmation)
+        )
         latest_by_campaign: dict[str, Cell] = {}
         for cell in sorted_cells:
             latest_by_campaign.setdefault(cell.entry.name, cell)
@@ -156,10 +166,22 @@ def evidence_text(verdict: Verdict) -> str:
     return f"{text}; over all cases {all_cases.failures:,} of {all_cases.n:,}"
 
 
-def basis_text(verdict: Verdict, robustness: Sequence[Robustness]) -> str:
-    """Describe that a verdict is based on the observed rate, and how far it reaches; may be empty."""
-    by_rate = "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
-    return "; ".join(filter(None, (by_rate, reach_text(verdict, robustness))))
+def describe_changes(verdict: Verdict, shared: SharedRequirement | None) -> str:
+    """Describe how a campaign has changed a shared requirement; empty if it has not."""
+    if shared is None:
+        return ""
+    bound = math.nan if shared.bound is None else shared.bound
+    values: dict[str, tuple[object, object]] = {
+        "required rate": (format_fraction(verdict.probability), format_fraction(shared.probability)),
+        "confidence": (format_fraction(verdict.confidence), format_fraction(shared.confidence)),
+        "population": (verdict.population, shared.population),
+        "metric": (verdict.metric, shared.metric),
+        "bound": (f"{verdict.bound:g}", f"{bound:g}"),
+        "scale": (f"{verdict.scale:g}", f"{shared.scale:g}"),
+        "decided by": (verdict.decide_by, shared.decide_by),
+    }
+    changes = [f"{name} {own}, not {other}" for name, (own, other) in values.items() if own != other]
+    return f"changed by the campaign: {'; '.join(changes)}" if changes else ""
 
 
 def margin_text(verdict: Verdict) -> str:

@@ -19,8 +19,8 @@ from marsyard.reports.dashboard.entries import Entry
 from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.dashboard.requirement_rows import (
     MAX_OTHER_VERDICTS,
+    Cell,
     RequirementRow,
-    basis_text,
     count_verdicts,
     evidence_text,
     margin_text,
@@ -36,7 +36,7 @@ from marsyard.reports.wording import NOTHING, percent
 INDEX = "index.html"
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 #: Functions that the templates call to format numbers and verdicts.
-_FORMATTERS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
+_FORMATTERS = {"margin": margin_text, "evidence": evidence_text, "percent": percent}
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,8 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
         for case in excerpts.cases
     ]
     multiplicity = multiplicity_text(entry.report.verdicts)
-    context = {"entry": entry, "cases": cases, "lists": excerpts.lists, "multiplicity": multiplicity}
+    cells = [Cell(entry, verdict) for verdict in entry.report.verdicts]
+    context = {"entry": entry, "cells": cells, "cases": cases, "lists": excerpts.lists, "multiplicity": multiplicity}
     write_atomic(page, _render("dashboard_campaign.html.j2", **context, **_FORMATTERS))
 
 
@@ -145,7 +146,7 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "rate": cell.verdict.estimate if math.isfinite(cell.verdict.estimate) else None,
                 "required": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
                 "rate_text": percent(cell.verdict.estimate),
-                "basis": basis_text(cell.verdict, cell.entry.report.robustness),
+                "basis": cell.basis,
             }
             for cell in row.all_cells
         ]

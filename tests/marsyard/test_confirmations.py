@@ -200,6 +200,7 @@ def _weaken_requirement(run: Path) -> None:
 def _change_dispersion(run: Path) -> None:
     path = run / "campaign.json"
     path.write_text(path.read_text().replace('"high": 99', '"high": 9'))
+    (run / ROWS_FILE).unlink()  # its chain of hashes begins with the hash of the definition
 
 
 def _replace_row(run: Path) -> None:
@@ -378,3 +379,33 @@ def test_record_of_confirmations_is_verified_without_its_repository(
         output = marsyard("assure", "--verify", elsewhere)
         assert output.status == 1
         assert named in output.out
+
+
+def test_package_lists_other_claims_of_the_record(
+    marsyard: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setenv(*BAD_LUCK)
+        assert confirm(marsyard, "run-1") == (1, ["FAIL"])
+    (tmp_path / "estimator.py").write_text("class Estimator:\n    version = 2\n")
+    commit_all(tmp_path)
+    assert confirm(marsyard, "run-2") == (4, ["PASS (other claims)"])
+    assert marsyard("assure", "run-2", "--out", "package").status == 0
+    defeaters = [
+        item["statement"]
+        for item in json.loads(Path("package/case.json").read_text())["elements"]
+        if item["type"] == "defeater"
+    ]
+    assert any(text.startswith("Other claims: 1: fake with estimator:Estimator") for text in defeaters)
+    assert marsyard("assure", "--verify", "package").status == 0
+    # the report conceals them
+    path = Path("package/runs/fake/report.json")
+    report = json.loads(path.read_text())
+    report["evidence"]["notes"] = []
+    report["verdicts"][0]["status"] = "PASS"
+    path.write_text(json.dumps(report))
+    rehash(Path("package"))
+    output = marsyard("assure", "--verify", "package")
+    assert output.status == 1
+    assert "VELOCITY is PASS in spite of other claims" in output.out
+    assert "report.json: evidence does not follow" in output.out

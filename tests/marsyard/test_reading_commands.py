@@ -61,6 +61,7 @@ def folders(tmp_path: Path) -> dict[str, Path]:
         folders[scenario] = shutil.copytree(original, tmp_path / f"run-{number}")
         record = json.loads((original / "campaign.json").read_text())
         record["definition"] |= {"scenario": scenario, "parameters": names | PARTS}
+        record["changes"] = [{"utc": "", "cases_before": 0, "in": ["the definition"]}]
         for entry in record["algorithms"]:
             entry |= {"spec": "trap:Estimator", "path": "trap:Estimator"}
         (folders[scenario] / "campaign.json").write_text(json.dumps(record))

@@ -94,6 +94,7 @@ def test_products_are_kept_if_the_replayed_case_fails(
     text = (copy / "campaign.json").read_text()
     changed_record = json.loads(text)
     changed_record["definition"]["parameters"]["raising_cases"] = [0]
+    changed_record["changes"] = [{"utc": "", "cases_before": 1, "in": ["the definition"]}]
     (copy / "campaign.json").write_text(json.dumps(changed_record))
     sign_folder(copy)
     status, output = run_command("replay", copy, 0)

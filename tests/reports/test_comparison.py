@@ -122,6 +122,15 @@ def test_terrains_of_different_banks_are_not_paired(make_run: MakeRun) -> None:
     assert _compare(runs[0], runs[0])[0]
 
 
+def test_stratified_designs_of_different_sizes_are_not_paired(make_run: MakeRun) -> None:
+    for kind, expected in (("random", True), ("latin-hypercube", False)):
+        runs = [
+            make_run(make_rows(cases), name=f"{kind}-{cases}", definition={"design": {"kind": kind}, "cases": cases})
+            for cases in (40, 80)
+        ]
+        assert _compare(*runs)[0] is expected
+
+
 def test_campaigns_with_different_draws_are_compared_as_two_samples(make_run: MakeRun) -> None:
     first = make_run(make_rows(300))
     is_paired, comparisons = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))

@@ -198,6 +198,17 @@ def test_pass_needs_one_row_for_each_case(make_run: MakeRun, cases: list[int]) -
     assert evaluation.overall_verdict.sentence.startswith("The rows are not those of 60 cases")
 
 
+def test_removed_entry_of_appended_cases_gives_no_verdict(make_run: MakeRun) -> None:
+    """Bounds of one look would be tighter."""
+    frame = make_frame(np.random.default_rng(1), 60).assign(velocity_error_m_s=1.0)
+    directory = make_run(frame, [REQUIREMENT], cases=60)
+    path = directory / "campaign.json"
+    record = json.loads(path.read_text())
+    for blocks, word in (({"cases": 40, "appended": [20]}, "PASS (exploration)"), ({"cases": 40}, "INSUFFICIENT")):
+        path.write_text(json.dumps(record | {"definition": record["definition"] | blocks}))
+        assert evaluate_run(directory).overall_verdict.word == word
+
+
 @pytest.mark.parametrize("state", ["running", "interrupted", "shard"])
 def test_unfinished_campaign_is_insufficient_everywhere(make_run: MakeRun, state: str) -> None:
     frame = make_frame(np.random.default_rng(1), 60)

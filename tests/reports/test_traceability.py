@@ -60,6 +60,13 @@ def test_junit_lists_failures_and_undecided_requirements() -> None:
     assert _read_message(completion_case, "failure") == "2 cases crashed"
 
 
+def test_junit_skips_the_completion_of_an_unfinished_campaign(make_run: Callable[..., Path]) -> None:
+    directory = make_run(make_rows(24), [], state="interrupted")
+    write_report(directory)
+    (completion_case,) = Xml.parse(directory / "junit.xml").getroot()  # noqa: S314
+    assert _read_message(completion_case, "skipped") == "INSUFFICIENT: the campaign is not finished"
+
+
 def test_junit_states_that_no_case_gives_no_lower_bound() -> None:
     frame = make_rows(0)
     verdicts = evaluate_requirements(frame, [VELOCITY])

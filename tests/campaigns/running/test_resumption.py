@@ -14,6 +14,7 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.origin import check_rows
 from tests.campaigns.fake_campaign import (
     CampaignFile,
     RecordingWatch,
@@ -111,6 +112,9 @@ def test_changed_definition_is_rejected(finished_campaign: Path, watch: Recordin
     sign_folder(finished_campaign)
     with pytest.raises(CampaignError, match="definition \\("):
         resume_campaign(finished_campaign, ExecutorConfig(1), watch)
+    # a report would state other parameters than those of the rows
+    with pytest.raises(StoreError, match="the definition is not the one with which the rows were stored"):
+        check_rows(finished_campaign)
 
 
 def test_store_of_another_campaign_is_rejected(
@@ -118,7 +122,7 @@ def test_store_of_another_campaign_is_rejected(
 ) -> None:
     other = run(campaign_file(""), tmp_path / "other", watch, "cases=1", "seed=77", jobs=1)
     shutil.copy(other / "cases.sqlite", finished_campaign / "cases.sqlite")
-    with pytest.raises(StoreError, match="belong to different campaigns"):
+    with pytest.raises(StoreError, match="the definition is not the one"):
         resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
 

@@ -105,6 +105,14 @@ def test_changed_shard_is_rejected(shards: list[Path], tmp_path: Path) -> None:
     assert not (tmp_path / "merged").exists()
 
 
+def test_rows_of_another_campaign_are_rejected(shards: list[Path], campaign_file: CampaignFile, tmp_path: Path) -> None:
+    (other,) = _run_shards(campaign_file("unanswered_cases = [2]"), tmp_path, 1)
+    shutil.copy(shards[0] / "campaign.json", other / "campaign.json")
+    with pytest.raises(CampaignError, match="the definition is not the one with which the rows were stored"):
+        merge_shards([other, *shards[1:]], tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+
+
 def test_changes_of_all_shards_are_merged_on_request(shards: list[Path], tmp_path: Path) -> None:
     copies = [shutil.copytree(shard, tmp_path / shard.name) for shard in shards]
     changes = [{"utc": "", "cases_before": 1, "in": [f"code ({number}, now 9)"]} for number in (1, 2)]

@@ -149,6 +149,27 @@ def test_package_verifies(package: Path) -> None:
             edit_json("report.json", lambda report: report["robustness"][0].update(passes_at=20.0)),
             f"{RUN}/report.json: robustness does not follow from the rows",
         ),
+        (
+            edit_json("report.json", lambda report: report.update(verdict="PASS", exit_code=0)),
+            f"{RUN}/report.json: verdict does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report["evidence"].update(kind="confirmation")),
+            f"{RUN}/report.json: evidence does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report["verdicts"][0].update(all_cases=None, consumer_risk=0.0)),
+            f"{RUN}/report.json: verdicts does not follow from the rows",
+        ),
+        (
+            edit_json("report.json", lambda report: report.update(git_commit="abc")),
+            f"{RUN}/report.json: git_commit does not follow from the rows",
+        ),
+        (
+            edit_text(f"{RUN}/verification.csv", "PASS (exploration)", "PASS"),
+            f"{RUN}/verification.csv: the content does not follow",
+        ),
+        (edit_text(f"{RUN}/junit.xml", "PASS (exploration)", "PASS"), f"{RUN}/junit.xml: the content does not follow"),
         (edit_text(ARGUMENT, "supported, with open defeaters", "supported"), "case.json: element G"),
         (edit_text("case.svg", "not shown", "supported"), "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
@@ -326,6 +347,22 @@ def test_report_of_another_layout_is_checked_by_its_rows_and_hashes(package: Pat
     change_row(package)
     rehash(package)
     assert "the row of case 7 was changed" in " ".join(verify_package(package).problems)
+
+
+def test_package_verifies_in_another_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report hides the home folder of its author in the path of a program, the record does not."""
+    program = "/home/author/estimator"
+    algorithm = {"spec": f"exec:{program} --fast", "role": "tested", "path": program, "options": {}}
+    run = write_stored_run(tmp_path / "run", cases=20, algorithms=[algorithm])
+    monkeypatch.setenv("HOME", "/home/author")
+    (tmp_path / "package").mkdir()
+    write_package([run], tmp_path / "package")
+    monkeypatch.setenv("HOME", "/home/reader")
+    assert verify_package(tmp_path / "package").problems == ()
+    change = edit_json("report.json", lambda report: report["algorithm_details"][0].update(name="exec:~/other --fast"))
+    change(tmp_path / "package")
+    rehash(tmp_path / "package")
+    assert any("algorithm_details" in problem for problem in verify_package(tmp_path / "package").problems)
 
 
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:

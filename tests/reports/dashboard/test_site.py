@@ -135,14 +135,38 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
     assert report.count('class="violation"') == index.count('class="violation"') > 0
 
 
-def test_reports_of_another_layout_are_written_again(
+def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_path: Path) -> None:
+    shared = shipped_requirements()["DIMES-VEL"].to_table()
+    for day, probability in ((1, 0.99), (2, 0.5)):
+        requirement = {**shared, "probability": probability}
+        make_run(
+            make_rows(24, error_scale=0.1)[MIN_COLUMNS],
+            [requirement],
+            name=f"run-{day}",
+            started_utc=f"2026-01-0{day}T00:00:00Z",
+        )
+    entries, _ = read_entries(find_campaigns([tmp_path]), tmp_path / "pages")
+    row = next(row for row in requirement_rows(entries, shipped_requirements()) if row.requirement == "DIMES-VEL")
+    assert [(cell.word, cell.basis.partition("; holds")[0]) for cell in row.all_cells] == [
+        ("INSUFFICIENT", ""),
+        ("PASS (exploration)", "changed by the campaign: required rate 50 %, not 99 %"),
+    ]
+
+
+def test_report_on_other_requirements_is_not_that_of_the_campaign(make_run: MakeRun, tmp_path: Path) -> None:
+    directory = make_run(make_rows(24)[MIN_COLUMNS])
+    write_report(directory, [{**VELOCITY, "probability": 0.1}])
+    assert not signature.is_own_report(directory, directory)
+    (entry,), _ = read_entries([directory], tmp_path / "pages")
+    assert entry.report.verdicts[0].probability == VELOCITY["probability"]
+
+
+def test_reports_of_another_program_are_written_again(
     make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory)
-    layout = tmp_path / "parts.html.j2"
-    layout.write_text("layout of another version", encoding="utf-8")
-    monkeypatch.setattr(signature, "_LAYOUT_FILES", (layout,))
+    monkeypatch.setattr(signature, "hash_program", lambda: "another version")
     assert not signature.is_own_report(directory, directory)
     write_site(tmp_path / "site", [directory])
     assert signature.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
