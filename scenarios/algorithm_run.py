@@ -23,8 +23,8 @@ class AlgorithmRun(Generic[Answer]):
 
     - answer: valid answer; None for a failure
     - failure: None for an answer
-    - row: columns: computation time (processor time; wall-clock time of an external program), with construction and
-      copying of the measurements; standard error
+    - row: columns: computation time (processor time; wall-clock time of an external program), with copying of the
+      measurements, and with construction if that is in this process; NaN after a failure; standard error
     """
 
     answer: Answer | None
@@ -47,7 +47,7 @@ def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer])
         elapsed_s = algorithm_time_s() - start_s
         answer = check(raw_answer)
     except Exception as error:
-        row: dict[str, Scalar] = {"estimation_time_s": algorithm_time_s() - start_s}
+        row: dict[str, Scalar] = {"estimation_time_s": float("nan")}  # the computation was not finished
         if isinstance(error, AlgorithmError):
             row |= {STDERR: error.stderr} if error.stderr else {}
             return AlgorithmRun(None, Failure(error.fault.name, str(error), error.trace), row)

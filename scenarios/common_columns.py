@@ -45,7 +45,10 @@ IMAGES = (
 ALGORITHM = (
     text("algorithm", "label of the algorithm under test", ColumnKind.PROVENANCE),
     text("stderr", "standard error of an external program", ColumnKind.PROVENANCE),
-    outcome("estimation_time_s", "processor time of the algorithm; wall-clock time of an external program"),
+    outcome(
+        "estimation_time_s",
+        "processor time of the algorithm; wall-clock time of an external program; missing after a failure",
+    ),
 )
 
 OFF_NADIR_MAX = condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle")

@@ -83,12 +83,20 @@ def parse_object(output: Output) -> Mapping[str, Any]:
     message = f"its output is not one JSON object: {shorten(output.stdout)}"
     try:
         # NaN and Infinity become floats; `read_numbers` rejects them with a message that names the key
-        answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float)
+        answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float, object_pairs_hook=_create_table)
     except (ValueError, RecursionError) as error:
         raise AlgorithmError(Fault.BAD_ANSWER, f"{message} ({error})", output.stderr) from error
     if not isinstance(answer, dict):
         raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     return answer
+
+
+def _create_table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Create the table of a JSON object. Raises ValueError if it contains a key twice: its value is ambiguous."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise ValueError("it contains a key twice")
+    return table
 
 
 @dataclass

@@ -82,7 +82,7 @@ class DescentInstruments:
         ) -> InstrumentReadings:
             """Return the readings of a custom instrument; add the columns of its parameter table to the row."""
             truth = InstrumentTruth(
-                times_s=times_s,
+                times_s=times_s.copy(),  # the instrument may change them; `tags` are also those of the images
                 motion=motion,
                 ground_height=lambda x, y: float(surface.height(x, y)),
                 nearest_ground=partial(first_return, surface),

@@ -126,8 +126,11 @@ class Host:
         from marsyard.scenarios.isolation.transport import Receiver
 
         self._receiver, self._is_seeded = Receiver(self._memory_fd), False
+        # construction and `reset` depend neither on the process nor on earlier cases
         if self._algorithm is None:
+            seed_generators(0)
             self._algorithm = construct(self._load(path, spec), device)
+        seed_generators(0)
         reset(self._algorithm)
         return {"members": list_members(self._algorithm)}
 
@@ -175,7 +178,7 @@ def _is_method(algorithm: Any, name: str) -> bool:
 
 
 def seed_generators(seed: int) -> None:
-    """Seed the global generators of the loaded libraries with a number that depends on the inputs of the case only."""
+    """Seed the global generators of the loaded libraries, with a number that does not depend on earlier cases."""
     random.seed(seed)
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed(seed)

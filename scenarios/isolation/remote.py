@@ -75,8 +75,8 @@ class RemoteAlgorithm:
     """
 
     def __init__(self, spec: str, limits: ExecutableLimits, classes: Mapping[str, type]) -> None:
-        """Start a case: construct the algorithm in its process, or reset it there."""
-        spec = absolute_spec(spec)
+        """Start a case: construct the algorithm in its process, or reset it there; `algorithm_time_s` excludes this."""
+        start_s, spec = time.process_time(), absolute_spec(spec)
         command = PythonCommand(spec=spec)
         self._classes = classes
         self._server = acquire_server(command, limits)
@@ -88,6 +88,7 @@ class RemoteAlgorithm:
         answer = self._request("start", start, start_up_s=limits.loading_s)
         members = answer.get("members")
         self._members = members if isinstance(members, dict) else {}
+        _Time.correction_s -= time.process_time() - start_s
 
     def __getattr__(self, name: str) -> Any:
         """Return a method of the algorithm, or the present value of an attribute."""

@@ -23,6 +23,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
 from marsyard.scenarios.algorithm_labels import labels
+from marsyard.scenarios.input_copies import hash_inputs
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import SCORE, check_columns
 from marsyard.sim.dynamics import State, Trajectory
@@ -173,10 +174,18 @@ class CustomScores(Parameters):
 
 
 def compute_scores(specs: Sequence[str], case: ScoredCase, existing_columns: Collection[str]) -> dict[str, Scalar]:
-    """Return the columns of all scores of a case. Raises ValueError for an invalid or an existing column."""
+    """Return the columns of all scores of a case.
+
+    Raises ValueError for an invalid or an existing column, and if a score changed the case: the truth and the images
+    are those of the later scores, figures and algorithms.
+    """
     row: dict[str, Scalar] = {}
+    case_hash = hash_inputs(case) if specs else ""
     for spec, label in zip(specs, labels(specs), strict=True):
-        for name, value in check_columns(spec, load_score(spec)(case), texts=False).items():
+        columns = check_columns(spec, load_score(spec)(case), texts=False)
+        if hash_inputs(case) != case_hash:
+            raise ValueError(f"'{spec}' changed its case; allowed: reading it, and changing copies")
+        for name, value in columns.items():
             column = f"{label}_{name}"
             if column in row or column in existing_columns:
                 raise ValueError(f"'{spec}' returns the column {column}, which the row already contains")

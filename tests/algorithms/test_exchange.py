@@ -184,6 +184,7 @@ def test_program_answer_and_stderr_are_stored(measurements: DescentMeasurements,
         (f"print({ANSWER}.replace('1.5', '[1.5]'))", Fault.BAD_ANSWER, "velocity_m_s"),
         (f"print({ANSWER}.replace('4]', '-4]'))", Fault.BAD_ANSWER, "not positive definite"),
         (f"print({ANSWER}.replace('covariance', 'kovariance'))", Fault.BAD_ANSWER, "unknown key 'kovariance_m2_s2'"),
+        (f"print({ANSWER}.replace('covariance_m2_s2', 'velocity_m_s'))", Fault.BAD_ANSWER, "it contains a key twice"),
         ('print(\'{"exchange": 3, "outcome": "VALID"}\')', Fault.BAD_ANSWER, "velocity_m_s is missing"),
     ],
 )

@@ -42,6 +42,25 @@ class Counting:
         return VelocityEstimate(VelocityOutcome.VALID, np.random.random_sample(2))  # noqa: NPY002
 
 
+class Wandering:
+    """Velocity estimator with a random answer, drawn at its construction and before each case; its start is slow."""
+
+    def __init__(self) -> None:
+        time.sleep(1.0)
+        self.first = np.random.random_sample()  # noqa: NPY002
+
+    def reset(self) -> None:
+        """Start a case."""
+        self.second = np.random.random_sample()  # noqa: NPY002
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`; takes 0.2 s of processor time."""
+        start_s = time.process_time()
+        while time.process_time() - start_s < 0.2:
+            pass
+        return VelocityEstimate(VelocityOutcome.VALID, np.array([self.first, self.second]))
+
+
 class Slow:
     """Velocity stream that waits at each image."""
 

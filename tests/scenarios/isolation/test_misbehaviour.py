@@ -3,6 +3,7 @@
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from marsyard.algorithms.exchange.serving import end_idle_programs
@@ -62,9 +63,8 @@ def test_misbehaviour_affects_only_its_own_row(
     result = run_case(monkeypatch, tmp_path, misbehaviour)
     assert result.outcome == EXPECTED[misbehaviour], result.failure
     assert compared_row(result) == healthy_rows[0]
-    time_s = result.row["estimation_time_s"]
-    assert isinstance(time_s, float)
-    assert time_s >= 0.0
+    # without an answer there is no computation time
+    assert np.isnan(result.row["estimation_time_s"]) == (result.failure is not None)
     assert not (tmp_path / "unpickled").exists()
     # the next case of the other algorithm is not affected either, and no process remains
     assert compared_row(run_case(monkeypatch, tmp_path, "none", case=1)) == healthy_rows[1]

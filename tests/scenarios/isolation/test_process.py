@@ -85,6 +85,19 @@ def test_random_numbers_depend_on_the_inputs_and_not_on_earlier_cases() -> None:
     assert velocities[0][0] != velocities[0][1]
 
 
+def test_random_numbers_of_construction_and_reset_do_not_depend_on_the_process() -> None:
+    columns = [f"velocity_estimated_{axis}_m_s" for axis in "xy"]
+    answers = []
+    for case in (0, 1, 1):  # the last one in a new process
+        row = run_case("Wandering", case).row
+        answers.append([row[name] for name in columns])
+        # processor time of the call, without the start of the process
+        assert 0.2 <= row["estimation_time_s"] < 0.3
+        if case == 1:
+            end_idle_programs()
+    assert answers[0] == answers[1] == answers[2]
+
+
 def test_truth_is_not_in_the_memory_or_files_of_the_process(log: Path) -> None:
     """The true inertial error and velocity are not found; in the worker itself they are."""
     case = Streams(7, "isolation", 0).generator("inertial").normal(size=3)

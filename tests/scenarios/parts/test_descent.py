@@ -73,7 +73,10 @@ class RotatedAttitude:
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
         rotation = Rotation.from_euler("z", self.yaw_error_deg, degrees=True)
-        return InstrumentReadings(truth.times_s, (rotation * truth.motion.motion(truth.times_s).attitudes).as_quat())
+        attitudes = (rotation * truth.motion.motion(truth.times_s).attitudes).as_quat()
+        times = truth.times_s.copy()
+        truth.times_s[:] = -1.0  # by mistake; the images keep their time tags
+        return InstrumentReadings(times, attitudes)
 
 
 def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
@@ -92,6 +95,12 @@ def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
 
 def return_existing_column(case: ScoredDescent) -> dict[str, float]:
     """Return a column whose full name (function name and key) exists in the row: `velocity_error_m_s`."""
+    return {"m_s": 1.0}
+
+
+def change_truth(case: ScoredDescent) -> dict[str, float]:
+    """Change the true velocity, which later scores and algorithms would receive."""
+    case.states[-1].velocity_m_s[:] = 0.0
     return {"m_s": 1.0}
 
 
@@ -186,3 +195,9 @@ def test_score_cannot_replace_a_column() -> None:
     spec = f"{MODULE}velocity_error"
     with pytest.raises(ValueError, match="returns the column velocity_error_m_s, which the row already contains"):
         compute_scores([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]
+
+
+def test_score_cannot_change_the_truth() -> None:
+    message = r"change_truth' changed its case; allowed: reading it, and changing copies"
+    with pytest.raises(ValueError, match=message):
+        run_descent(terrain=FLAT_TERRAIN, scores=[f"{MODULE}change_truth", f"{MODULE}record_inputs"])
