@@ -68,7 +68,9 @@ def test_changed_tree_is_refused(
     assert (tmp_path / RECORD).read_text() == ""
 
 
-def test_files_that_do_not_determine_rows_are_no_part_of_the_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_do_not_determine_rows_are_no_part_of_the_tree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     create_project(tmp_path)
     monkeypatch.chdir(tmp_path)
     tree = queue.hash_tree(Path("confirmations.jsonl"), tmp_path / "no.log")
