@@ -104,13 +104,18 @@ def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) 
     footprint is not in both images, divided by the largest such distance; NaN without a site.
     `site_far_from_hazards`: it is at least `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest
     from all hazards, which include the border of the map (section III). `site_hazard_distance_m` is the distance to the
-    nearest unsafe position of the grid, in both images or not.
+    nearest unsafe position of the grid, in both images or not. `site_height_error_m` is the height of the reported site
+    minus that of the ground, the mean of a lander's width; NaN without a reported site.
     """
     position = true_site(estimate, flight)
     row = _ground_row("site", position, truth)
     is_target_safe, reports_site = bool(row["site_safe"]), estimate.outcome is SiteOutcome.SAFE_SITE
     reports_safe_site, refuses = reports_site and is_target_safe, estimate.outcome is SiteOutcome.NO_SAFE_SITE
-    clearance = truth.clearance_fraction(position) if reports_site and position is not None else np.nan
+    clearance = height_error_m = np.nan
+    if reports_site and position is not None and estimate.site_world is not None:
+        clearance = truth.clearance_fraction(position)
+        ground_m = float(truth.relief.average(position[None, None], truth.limits.diameter_m)[0, 0])
+        height_error_m = float((estimate.site_world - flight.position_error_m)[2]) - ground_m
     return {
         **row,
         "site_safe": reports_safe_site,
@@ -119,6 +124,7 @@ def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) 
         "answer_correct": reports_safe_site or (refuses and not np.any(truth.safe_with_margin)),
         "site_clearance_fraction": clearance,
         "site_far_from_hazards": clearance >= MIN_CLEARANCE_FRACTION,
+        "site_height_error_m": height_error_m,
     }
 
 

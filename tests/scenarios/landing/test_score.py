@@ -169,6 +169,8 @@ def test_clearance_is_relative_to_the_farthest_position() -> None:
         site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (1.0, -3.0)
     )
     assert (far["site_far_from_hazards"], near["site_far_from_hazards"]) == (True, False)
+    # a slope of 45 deg: the ground is at 1 m, and at 0 m in the west
+    assert [row["site_height_error_m"] for row in (far, near)] == pytest.approx([-1.0, 0.0], abs=0.06)
 
 
 @pytest.mark.parametrize("seed", range(20))
