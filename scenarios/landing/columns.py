@@ -146,7 +146,9 @@ COLUMNS = Columns(
             "largest one",
             "distance from hazards and border / largest distance",
         ),
-        error("site_height_error_m", "height of the reported site minus that of the ground", "height error of the site"),
+        error(
+            "site_height_error_m", "height of the reported site minus that of the ground", "height error of the site"
+        ),
         outcome("site_slope_deg", "true slope at the site", "true slope at the site"),
         outcome("site_roughness_m", "true roughness at the site", "true roughness at the site"),
         error(
