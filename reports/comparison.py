@@ -21,7 +21,7 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.statistics.difference_tests import correct_holm
 from marsyard.reports.statistics.paired_tests import compare_errors, compare_successes
-from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, p_text, percent
+from marsyard.reports.wording import NOTHING, count, format_fraction, note_text, number, p_text, percent
 from marsyard.scenarios.columns import split_unit
 
 
@@ -149,7 +149,9 @@ def comparison_section(subject: Subject) -> Section | None:
     result_grid, difference_grid = comparison_grids(results, differences, subject.metric)
     tested_name = results[0].name
     note = note_text("common.comparison", tested=tested_name, confidence=format_fraction(CONFIDENCE))
-    blocks = [Block(grid=result_grid)]
+    left_out = len(subject.frame) - results[0].cases
+    left_out_note = f"Left out: {count(left_out, 'case')} that ended before all algorithms had run."
+    blocks = [Block(grid=result_grid, note=left_out_note if left_out else "")]
     if differences:
         blocks.append(Block(heading=f"Against {tested_name}", grid=difference_grid, note=note))
     data = {"algorithms": results, "against": tested_name, "differences": differences}

@@ -193,6 +193,10 @@ def _combine_verdicts(
     )
     remedy = find_remedy(verdicts, len(frame))
     remedy_text = f" {remedy.text}" if remedy.text else ""
+    if sampling.max_cases is not None:
+        # appended cases would be a look that was not planned
+        limit = count(sampling.max_cases, "case")
+        remedy_text = f" Looks are planned up to {limit}; a new campaign, with a new seed, can permit more."
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",

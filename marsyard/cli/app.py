@@ -121,7 +121,8 @@ app = typer.Typer(
     help="Run vision software on simulated Mars images with ground truth, and report whether it meets its requirements "
     "at a stated confidence level.",
     epilog="Exit status: 0 all requirements met, or no requirements; 1 a requirement failed, or a case crashed; "
-    "2 the command or a file is invalid; 3 no verdict: too few cases, or cases that are not independent random draws; "
+    "2 the command or a file is invalid; 3 no verdict: too few or unfinished cases, cases that are not independent "
+    "random draws, or requirements that are met by rate only; "
     "4 all requirements met, but a person must judge the evidence; 130 interrupted.",
 )
 

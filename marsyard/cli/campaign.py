@@ -29,9 +29,9 @@ def run(
     cluster: options.ClusterOption = None,
     case_time: options.CaseTimeOption = None,
     out: options.OutOption = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
-        False
-    ),
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Only estimate time and disk space, and name what excludes PASS.")
+    ] = (False),
     until_decided: Annotated[
         bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
     ] = False,
@@ -41,7 +41,7 @@ def run(
         bool,
         Option(
             "--confirm",
-            help="Evaluate a frozen algorithm on unseen cases: draw a new seed, and record the run before it starts.",
+            help="Evaluate a frozen algorithm on unseen cases: derive a new seed, and record the run before it starts.",
         ),
     ] = False,
     confirmations: options.ConfirmationsOption = options.CONFIRMATIONS,

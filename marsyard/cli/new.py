@@ -82,9 +82,11 @@ def new(
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
     if bound is None:
         bound = float(_ask_user(question, default, is_interactive, partial(_find_number_problem, template.max_bound)))
-    elif not math.isfinite(bound):
-        raise CampaignError(f"--bound {bound:g}: allowed: a finite number")
-    choices = Choices(name, site, camera, detector or "", flight, axes, bound, cases)
+    elif problem := _find_number_problem(template.max_bound, f"{bound:g}"):
+        raise CampaignError(f"--bound: {problem}")
+    choices = Choices(
+        name, site, camera=camera, detector=detector or "", flight=flight, axes=axes, bound=bound, cases=cases
+    )
     campaign = _write_and_load(path, template, choices)
     summary = f"{path}: {system} over {site}, {count(cases, 'case')}"
     typer.echo(f"{summary}. To show it: `marsyard show {path}`. To run it:\n  marsyard run {path}")
@@ -111,7 +113,10 @@ def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) ->
     try:
         return load_campaign(str(path))
     except CampaignError:
-        path.unlink() if previous_text is None else path.write_text(previous_text, encoding="utf-8")
+        if previous_text is None:
+            path.unlink()
+        else:
+            path.write_text(previous_text, encoding="utf-8")
         raise
 
 

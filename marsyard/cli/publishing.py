@@ -41,7 +41,7 @@ def dashboard(
     typer.echo(f"campaigns: {site.campaigns}")
     typer.echo(f"dashboard: {site.index}")
     if serve is None:
-        return
+        raise typer.Exit(1 if site.problems else 0)
     from marsyard.reports.dashboard.server import create_server
 
     try:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import optimize, stats
 
 #: Minimum number of cases with condition and response for an estimate.
@@ -19,6 +19,8 @@ MIN_CASES = 20
 _MIN_PAIRS = 4
 #: Number of cases per bin for the fraction of variance, and the maximum number of bins.
 _CASES_PER_BIN, _MAX_BINS = 15, 20
+#: Number of events below which the p-value of a flag is not that of the F-test alone, and number of permutations.
+_FEW_EVENTS, _PERMUTATIONS = 30, 20_000
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class Driver:
     - correlation, lower, upper: Spearman's rank correlation and its interval
     - fraction, fraction_lower, fraction_upper: first-order sensitivity index and its interval: the fraction (0 to 1) of
       the variance of the response's ranks that the condition alone explains, for any form of the curve
-    - p_value: p-value of the null hypothesis that the condition has no effect
+    - p_value: p-value of the null hypothesis that the condition has no effect, by the F-test of the bins; for a flag
+      with few events, which the F-test finds significant too often, the larger one of this and of a permutation test
     """
 
     n: int
@@ -90,26 +93,41 @@ def explained_fraction(condition: Float[np.ndarray, " n"], response: Float[np.nd
     n = int(finite.sum())
     if n < _MIN_PAIRS or np.ptp(condition[finite]) == 0.0 or np.ptp(response[finite]) == 0.0:
         return 0.0
-    bins, between, total = _sum_squares(stats.rankdata(condition[finite]), stats.rankdata(response[finite]))
+    x, y = stats.rankdata(condition[finite]), stats.rankdata(response[finite])
+    bins, between, total = _sum_squares(_divide_into_bins(x), y)
     return max(0.0, (between - (bins - 1.0) * (total - between) / (n - bins)) / total)
 
 
-def _sum_squares(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
-    """Divide the ranks x into bins; return their number, and the sums of squares of y between them and in all."""
+def _divide_into_bins(x: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Divide the ranks x into at least two bins with equal numbers of cases; return the bin of each case, from 0."""
     max_bins = int(np.clip(x.size // _CASES_PER_BIN, 2, _MAX_BINS))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
     # intervals closed on the left, so that each value of a condition with two values has its own bin
     bin_index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
     if bin_index.max() == 0:
         bin_index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
+    return np.asarray(bin_index, dtype=np.int64)
+
+
+def _sum_squares(bin_index: Int[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
+    """Return the number of bins, and the sums of squares of y between them and in all."""
     means = np.bincount(bin_index, weights=y) / np.bincount(bin_index)
     total = float(((y - y.mean()) ** 2).sum())
     between = float((np.bincount(bin_index) * (means - y.mean()) ** 2).sum())
     return int(bin_index.max()) + 1, between, total
 
 
+def _permutation_p_value(bin_index: Int[np.ndarray, " n"], event: Bool[np.ndarray, " n"]) -> float:
+    """Return the probability that random cases with these events differ at least as much between the bins."""
+    sizes, observed = np.bincount(bin_index), np.bincount(bin_index, weights=event)
+    counts = np.random.default_rng(0).multivariate_hypergeometric(sizes, int(event.sum()), _PERMUTATIONS)
+    # the sum of squares between the bins, without constants
+    is_larger = (counts**2 / sizes).sum(axis=1) >= (observed**2 / sizes).sum() * (1.0 - 1e-12)
+    return float((1 + is_larger.sum()) / (1 + _PERMUTATIONS))
+
+
 class _ExplainedFraction(NamedTuple):
-    """Fraction of a variance between bins, its interval, and the p-value of the F-test; see `Driver`."""
+    """Fraction of a variance between bins, its interval, and its p-value; see `Driver`."""
 
     fraction: float
     lower: float
@@ -121,7 +139,8 @@ def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective_n: float, confidence: float
 ) -> _ExplainedFraction:
     """Estimate the fraction of the variance of the ranks y between bins of the ranks x."""
-    bins, between, total = _sum_squares(x, y)
+    bin_index, is_high = _divide_into_bins(x), y > y.min()
+    bins, between, total = _sum_squares(bin_index, y)
     if between >= (1.0 - 1e-9) * total:
         return _ExplainedFraction(1.0, 1.0, 1.0, 0.0)
     within_degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
@@ -153,6 +172,9 @@ def _estimate_explained_fraction(
 
     tail = 0.5 * (1.0 - confidence)
     p_value = float(stats.f.sf(f_ratio, bins - 1.0, within_degrees))
+    is_flag = np.ptp(y[is_high]) == 0.0
+    if is_flag and min(is_high.sum(), y.size - is_high.sum()) < _FEW_EVENTS:
+        p_value = max(p_value, _permutation_p_value(bin_index, is_high))
     return _ExplainedFraction(fraction, find_fraction(1.0 - tail), find_fraction(tail), p_value)
 
 

@@ -156,8 +156,9 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
         (("--system", "velocty"), "unknown system 'velocty' (did you mean 'velocity'?); allowed: landing, tracking"),
         (("--system", "velocity", "--camera", "absent.yaml"), "absent.yaml: file: cannot be read"),
         (("--system", "tracking", "--camera", "cam.yaml"), "see camera.preset"),
-        (("--system", "velocity", "--bound", "nan"), "--bound nan: allowed: a finite number"),
-        (("--system", "landing", "--bound", "inf"), "--bound inf: allowed: a finite number"),
+        (("--system", "velocity", "--bound", "nan"), "--bound: 'nan' is not allowed; allowed: a number above 0"),
+        (("--system", "landing", "--bound", "inf"), "--bound: 'inf' is not allowed; allowed: a number above 0 and"),
+        (("--system", "velocity", "--bound", "-5"), "--bound: '-5' is not allowed; allowed: a number above 0"),
         (("--system", "landing", "--flight", "flight.csv"), "only descents accept"),
     ],
 )

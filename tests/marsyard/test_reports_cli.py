@@ -98,6 +98,12 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, tmp_path: Pa
     make_run("run")
     status, out, _ = marsyard("dashboard", tmp_path, "--out", tmp_path / "site")
     assert (status, "campaigns: 1" in out) == (0, True)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    for name in ("campaign.json", "cases.parquet"):
+        (broken / name).write_text("{}")
+    status, out, err = marsyard("dashboard", tmp_path, "--out", tmp_path / "site")
+    assert (status, "campaigns: 1" in out, f"not shown: {broken}" in err) == (1, True, True)
     assert marsyard("dashboard", tmp_path / "none")[0] == 2
     with create_server(tmp_path / "site", "127.0.0.1", 0) as http_server:
         assert http_server.server_address[0] == "127.0.0.1"

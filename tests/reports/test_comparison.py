@@ -9,11 +9,12 @@ import pytest
 from scipy import stats
 
 from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid, compare_campaigns
-from marsyard.reports.comparison import compare_algorithms, select_algorithm
+from marsyard.reports.comparison import compare_algorithms, comparison_section, select_algorithm
 from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.metrics import list_metrics
+from marsyard.reports.section import Subject
 from marsyard.reports.statistics.difference_tests import difference_p_value
-from marsyard.reports.stored import read_run
+from marsyard.reports.stored import StoredRun, read_run
 from tests.reports.synthetic_run import MakeRun, make_rows
 
 
@@ -37,6 +38,14 @@ def test_paired_comparison_averages_the_cases_that_both_algorithms_answer() -> N
     ] == [("dimes", 4, 0, 3), ("other", 3, 1, 3)]
     assert (difference.only_first, difference.only_other, difference.pairs) == (1, 1, 3)
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
+
+
+def test_cases_without_all_algorithms_are_left_out_and_counted() -> None:
+    frame = make_paired_rows([1.0] * 8, [2.0] * 8).astype({"other.answered": object})
+    frame.loc[:1, "other.answered"] = None
+    section = comparison_section(Subject(StoredRun(Path("run"), frame, frame, {}, ()), "velocity_error_m_s", 5.0))
+    assert section is not None
+    assert section.blocks[0].note == "Left out: 2 cases that ended before all algorithms had run."
 
 
 def test_unfinished_cases_are_no_successes_and_have_no_error() -> None:

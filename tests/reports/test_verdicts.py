@@ -82,6 +82,10 @@ def test_remedy_at_the_observed_rate_uses_the_first_look() -> None:
     assert find_remedy([verdict], 300).text.endswith("about 2,204 more are needed.")
     (planned,) = evaluate_requirements(frame, [VELOCITY], SamplingDesign(max_cases=1000))
     assert "rate so far" not in find_remedy([planned], 300).text
+    # appended cases would be a look that was not planned
+    overall = combine_verdicts([planned], frame, SamplingDesign(max_cases=1000))
+    assert "planned up to 1,000 cases; a new campaign" in overall.sentence
+    assert "additional" not in overall.sentence
 
 
 def test_populations_select_cases() -> None:

@@ -1,5 +1,7 @@
 """Tests of `estimate_driver` (effect of a condition on errors): rank correlation, explained variance, intervals."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -78,3 +80,12 @@ def test_explained_fraction_is_1_for_constant_responses() -> None:
     result = estimate_driver(condition, condition / 400.0, None, 0.9)
     assert (result.fraction, result.fraction_lower, result.fraction_upper, result.p_value) == (1.0, 1.0, 1.0, 0.0)
     assert result.correlation == pytest.approx(1.0)
+
+
+def test_few_events_in_one_bin_have_the_exact_probability() -> None:
+    """Three events in one of six bins of 15 cases: six times C(15, 3) of C(90, 3) choices."""
+    condition, failed = np.arange(90.0), np.zeros(90)
+    failed[[16, 20, 27]] = 1.0
+    assert _estimate_driver(condition, failed).p_value == pytest.approx(
+        6 * math.comb(15, 3) / math.comb(90, 3), rel=0.1
+    )
