@@ -31,7 +31,7 @@ def run(
     out: options.OutOption = None,
     dry_run: Annotated[
         bool, Option("--dry-run", help="Only estimate time and disk space, and name what excludes PASS.")
-    ] = (False),
+    ] = False,
     until_decided: Annotated[
         bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
     ] = False,
