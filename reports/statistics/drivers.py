@@ -141,8 +141,11 @@ def _estimate_explained_fraction(
     """Estimate the fraction of the variance of the ranks y between bins of the ranks x."""
     bin_index, is_high = _divide_into_bins(x), y > y.min()
     bins, between, total = _sum_squares(bin_index, y)
+    is_flag = np.ptp(y[is_high]) == 0.0
+    has_few_events = is_flag and min(is_high.sum(), y.size - is_high.sum()) < _FEW_EVENTS
+    permutation_p = _permutation_p_value(bin_index, is_high) if has_few_events else 0.0
     if between >= (1.0 - 1e-9) * total:
-        return _ExplainedFraction(1.0, 1.0, 1.0, 0.0)
+        return _ExplainedFraction(1.0, 1.0, 1.0, permutation_p)
     within_degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
     within = total - between
     f_ratio = between / (bins - 1.0) / (within / within_degrees)
@@ -171,10 +174,7 @@ def _estimate_explained_fraction(
         return ratio_of_variances / (1.0 + ratio_of_variances)
 
     tail = 0.5 * (1.0 - confidence)
-    p_value = float(stats.f.sf(f_ratio, bins - 1.0, within_degrees))
-    is_flag = np.ptp(y[is_high]) == 0.0
-    if is_flag and min(is_high.sum(), y.size - is_high.sum()) < _FEW_EVENTS:
-        p_value = max(p_value, _permutation_p_value(bin_index, is_high))
+    p_value = max(float(stats.f.sf(f_ratio, bins - 1.0, within_degrees)), permutation_p)
     return _ExplainedFraction(fraction, find_fraction(1.0 - tail), find_fraction(tail), p_value)
 
 
