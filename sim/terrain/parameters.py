@@ -59,7 +59,8 @@ class TerrainParameters(Parameters):
         bool, Field(description="whether sand darkens the hollows of the fractal relief, and leaves its crests bright")
     ] = False
     relief_log_albedo: Annotated[
-        float, bounded_field(-1.0, 1.0, "log albedo of ridges of fine relief relative to the ground; 0: no ridges")
+        float,
+        bounded_field(-1.0, 1.0, "log albedo of fine relief above sand-filled hollows, per mean height; 0: unfilled"),
     ] = 0.0
     units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
     fine_below_m: Annotated[

@@ -15,8 +15,6 @@ from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE, UNIFORM, Surface, e
 
 #: The landforms in the order in which they are added to the fractal ground; drifts follow the craters.
 LANDFORMS = ("fans", "playa", "lava", "swell", "strata", "ramp", "outcrop", "gullies", "dunes", "ripples")
-#: Height of the ridges of fine relief, divided by its mean absolute height (assumed): the ground between them is level.
-RIDGE_HEIGHT = 1.5
 
 
 def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surface:
@@ -75,18 +73,16 @@ def _add_fine_ground(
 ) -> None:
     """Add fine relief and albedo, scaled by the factors of the surface units, to the ground; changes both in place.
 
-    With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``.
-    The log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
+    With `relief_log_albedo` sand fills the hollows of the relief z up to its mean height (assumed), and the log albedo
+    of the ground above it rises by `relief_log_albedo` per mean of abs(z).
     """
     height, log_albedo = fine.height, fine.log_albedo
     roughness, texture = (
         refine(np.ascontiguousarray(factors[..., channel]), ground.side) for channel in (ROUGHNESS, TEXTURE)
     )
     if relief_log_albedo:
-        np.abs(height, out=height)
-        mean = float(height[::FACTOR_STEP, ::FACTOR_STEP].mean(dtype=np.float64))
-        np.minimum(height, np.float32(RIDGE_HEIGHT * mean), out=height)
-        np.negative(roughness, out=roughness)
+        np.maximum(height, 0.0, out=height)
+        mean = 2.0 * float(height[::FACTOR_STEP, ::FACTOR_STEP].mean(dtype=np.float64))  # of abs(z)
     height *= roughness
     log_albedo *= texture
     ground.add(fine)

@@ -34,8 +34,10 @@ FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast
 SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
 #: Outlines in the table, and positions along each; waves around an outline; RMS of its radius, and exponent of the
 #: waves' amplitudes (assumed): a real rim is scalloped at all scales, and deviates from a circle by 5 to 10 %.
-OUTLINES, POSITIONS, OUTLINE_WAVES = 64, 256, (2, 24)
-OUTLINE_RMS, OUTLINE_EXPONENT = 0.06, -1.25
+OUTLINES, POSITIONS, OUTLINE_WAVES = 64, 256, (2, 28)
+OUTLINE_RMS, OUTLINE_EXPONENT = 0.05, -1.1
+#: Relative increase of the fill's strength per radius towards the wind, in craters whose albedo wears (assumed).
+WIND_ASYMMETRY = 0.8
 RAY_WAVES = (5, 16)  #: Rays around a crater: waves of equal amplitude (assumed).
 WORN_EXTENT_RADII = 1.6  #: Extent of the ejecta of the most worn craters, in radii (assumed).
 #: Small craters in clusters of secondaries (assumed): largest diameter, fraction, number and radius of a cluster.
@@ -123,7 +125,8 @@ def _wear_albedo(
     """Make fill and ejecta of craters, a table of type `CRATER`, depend on their age, in place.
 
     A deep bowl shelters more sand than a shallow one. Ejecta are mixed into the soil as the rim wears, and the border
-    of the fill becomes gradual. Large craters have a deposit of dust in their middle. All laws are assumed.
+    of the fill becomes gradual. Large craters have a deposit of dust in their middle. The fill is thicker on the upwind
+    side if the terrain has units with a wind. All laws are assumed.
     """
     count, diameter = len(craters), 2.0 * craters["radius"]
     size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
@@ -138,7 +141,12 @@ def _wear_albedo(
     margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
     craters["margin"] = np.minimum(2.0 * margin_m / diameter, 0.5)
     craters["fill_radius"] = 1.0 + 0.2 * craters["margin"]
-    craters["core"] = size_factor * rng.uniform(0.3, 1.0, count)
+    craters["core"] = size_factor * rng.uniform(0.2, 0.7, count)
+    if p.units is not None:
+        # sand gathers in the lee of the upwind rim
+        upwind = np.radians(90.0 - p.units.wind_from_deg)
+        craters["lee_x"] = 0.5 * craters["lee_x"] + WIND_ASYMMETRY * np.cos(upwind)
+        craters["lee_y"] = 0.5 * craters["lee_y"] + WIND_ASYMMETRY * np.sin(upwind)
 
 
 def _gather_secondaries(

@@ -121,7 +121,7 @@ class SurfaceUnits(Parameters):
         if len(craters):
             # assumed factors of roughness on the floor and on the ejecta
             floor_factor, ejecta_factor = (
-                1.0 - 1.6 * craters["fill"],
+                1.0 - 0.8 * craters["fill"],
                 1.0 + np.clip(crater_freshness(craters), 0.0, 1.0),
             )
             circles = (craters["x"], craters["y"], craters["radius"])

@@ -13,11 +13,12 @@ from marsyard.sim.terrain.kernels import Array, Grid
 RIM_HEIGHT_SENSITIVITY = 8.0
 #: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
 RAY_CONTRAST = 0.25
-#: Radius of the deposit in the middle of a crater's fill, in crater radii; wavelength and amplitude of the ridges on
-#: it, metres (assumed; transverse ridges in craters: Balme et al. 2008).
-CORE_RADIUS, RIDGE_WAVELENGTH_M, RIDGE_HEIGHT_M = 0.7, 10.0, 0.15
+#: Mean radius of the deposit in the middle of a crater's fill, in crater radii; its change per relative displacement of
+#: an outline, and towards the lee; wavelength and height of the ridges on it, metres (assumed; transverse ridges in
+#: craters: Balme et al. 2008).
+CORE_RADIUS, CORE_SCALLOPS, CORE_LEE, RIDGE_WAVELENGTH_M, RIDGE_HEIGHT_M = 0.7, 4.0, 0.5, 10.0, 0.3
 #: Finer scallops in the fill's border of large craters: their size, and the factor of their wavenumbers (assumed).
-TEETH, TEETH_STEP = 0.4, 5
+TEETH, TEETH_STEP = 0.3, 5
 
 
 @njit(cache=True, inline="always")
@@ -30,16 +31,21 @@ def _azimuth_fraction(c: float, s: float) -> float:
 
 
 @njit(cache=True, inline="always")
-def _core_deposit(dx: float, dy: float, radius: float, lee_x: float, lee_y: float) -> tuple[float, float]:
+def _core_deposit(
+    dx: float, dy: float, radius: float, scallop: float, lee_x: float, lee_y: float
+) -> tuple[float, float]:
     """Return the coverage by the deposit in a crater's middle, and the height of its ridges, metres.
 
-    The deposit is displaced in the direction (lee_x, lee_y); the ridges run across it, and their crests wander.
+    The deposit's border has the relative displacement `scallop` of an outline, and is nearer to the middle in the
+    direction (lee_x, lee_y), where there is more sand; the ridges run across it, and their crests wander.
     """
-    x, y = dx / radius - lee_x, dy / radius - lee_y
-    phase = (lee_x * dx + lee_y * dy) / max(math.hypot(lee_x, lee_y), 1e-9)
+    along = lee_x * dx + lee_y * dy
+    border = radius * CORE_RADIUS * (1.0 + CORE_SCALLOPS * scallop) - CORE_RADIUS * CORE_LEE * along
+    coverage = 1.5 * (1.0 - (dx * dx + dy * dy) / max(border * border, 1e-9))
+    phase = along / max(math.hypot(lee_x, lee_y), 1e-9)
     phase += 4.0 * math.sin((lee_x * dy - lee_y * dx) / RIDGE_WAVELENGTH_M)
     ridge = RIDGE_HEIGHT_M * math.sin(2.0 * math.pi / RIDGE_WAVELENGTH_M * phase)
-    return max(1.0 - (x * x + y * y) / (CORE_RADIUS * CORE_RADIUS), 0.0), ridge
+    return min(max(coverage, 0.0), 1.0), ridge
 
 
 @njit(cache=True)
@@ -58,7 +64,8 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
     `outlines` and `rays` have a row per outline: the relative change of the radius, and the strength of the rays, at
     positions of `_azimuth_fraction`. With the distance r from the centre in radii, the bowl rises with r**2.2. The
     ejecta blanket falls with r**-3, has rays outside the rim and ends at its extent. The rim is lower where the outline
-    is displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-a r**-3).
+    is displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-a r**-3), and by r**2 of
+    that within the rim, because debris covers them towards the middle.
     """
     mask, positions = height.shape[0] - 1, outlines.shape[1]
     for n in range(craters.shape[0]):
@@ -115,13 +122,15 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 height[row, column] += change
                 if ejecta_log_albedo != 0.0:
                     coverage = 1.0 - math.exp(-opacity * thickness * strength)
-                    log_albedo[row, column] += ejecta_log_albedo * coverage * fade
+                    log_albedo[row, column] += ejecta_log_albedo * coverage * fade * min(r * r, 1.0)
                 if fill_log_albedo != 0.0 and r < fill_radius:
                     # the fill thins out at its margin, and upwind
                     edge = fill_radius - r + (TEETH * outline[(TEETH_STEP * k) % positions] if core > 0.0 else 0.0)
                     filled = min(max(edge, 0.0) / margin, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
                     if core > 0.0:
-                        middle, ridge = _core_deposit(dx, dy, radius, lee_x, lee_y)
+                        middle, ridge = _core_deposit(
+                            dx, dy, radius, outline[(first + positions // 2) % positions], lee_x, lee_y
+                        )
                         filled *= 1.0 - core * middle
                         height[row, column] += core * middle * ridge
                     log_albedo[row, column] += fill_log_albedo * filled
