@@ -278,7 +278,7 @@ def test_deposit_in_the_middle_has_ridges_and_less_sand() -> None:
     }
     columns |= {"lee_x": 0.05, "margin": 0.1}
     (height, bright), (flat, dark) = (_stamp(256, **columns, core=core) for core in (0.8, 1e-9))
-    # the lee, 0.05, increases the sand on its side, here at 0.1 radii, and moves the border of the deposit inwards there
+    # the lee, 0.05, increases the sand on its side, here at 0.1 radii, where the border of the deposit is nearer
     assert bright[128, 134] == pytest.approx(-0.5 * (1.0 + 0.05 * 0.1) * (1.0 - 0.8), rel=1e-3)
     ridges = height - flat
     assert np.abs(ridges).max() == pytest.approx(0.8 * RIDGE_HEIGHT_M, rel=0.05)
