@@ -21,7 +21,9 @@ _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
 #: the joints, and length of their bends, in sizes; height above the sand over which dust covers a slab, in heights;
 #: fraction of the large slabs that the second generation divides (assumed).
-_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.6, 0.35, 0.6
+_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.15, 0.6, 0.35, 0.6
+
+_SAND_TONE = -0.15  #: Mean logarithm of the albedo of sand between slabs, divided by that of other ground.
 
 
 class Strata(Parameters):
@@ -93,9 +95,9 @@ class Outcrop(Parameters):
         # the components of a smooth field have the variance 1/2
         depth = np.sqrt(2.0) * _RISE * (patch - np.quantile(patch, 1.0 - self.fraction))
         bedrock = self.height_m * (np.minimum(depth, 1.0) - np.sqrt(2.0) * _SAND_HEIGHT * sand)
-        sand_tone = np.sqrt(2.0) * self.sand_log_albedo_sd * tone
+        sand_tone = _SAND_TONE + np.sqrt(2.0) * self.sand_log_albedo_sd * tone
         generations = [
-            self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
+            self._draw_slabs(ground.period_m, size, height, rng)
             for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
         generations[0].slabs[..., LOG_ALBEDO] += self.log_albedo
@@ -104,7 +106,7 @@ class Outcrop(Parameters):
         add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, _FRACTURED, edge)
         ground.add(layer)
 
-    def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
+    def _draw_slabs(self, period_m: float, size: float, height: float, rng: Generator) -> Slabs:
         """Draw the slabs of a generation with this size and height relative to the parameters."""
         # a Voronoi cell needs neighbours on all sides
         cells = max(round(period_m / (size * self.slab_m)), 3)
@@ -118,7 +120,7 @@ class Outcrop(Parameters):
             ],
             axis=-1,
         )
-        joint, depth = max(size * self.joint_m, spacing_m), _JOINT_DEPTH * height * self.height_m
+        joint, depth = size * self.joint_m, _JOINT_DEPTH * height * self.height_m
         positions = locate_points(rng.uniform(0.02, 0.98, (cells, cells, 2)))
         return Slabs(
             positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), period_m / cells, joint, depth, rise
