@@ -22,7 +22,8 @@ _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: the joints, and length of their bends, in sizes; height above the sand over which dust covers a slab, in heights;
 #: fraction of the large slabs that the second generation divides (assumed).
 _SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.15, 0.6, 0.35, 0.6
-_SAND_TONE = -0.15  #: Mean logarithm of the albedo of sand between slabs, divided by that of other ground (assumed).
+#: Mean logarithm of the albedo of sand between slabs, divided by that of other ground (calibrated: see `Outcrop`).
+_SAND_TONE = -0.2
 
 
 class Strata(Parameters):
@@ -65,7 +66,8 @@ class Outcrop(Parameters):
     Slabs are cells of a Voronoi diagram with curved borders. Each has its own height, tilt and albedo. A second, finer
     generation of joints divides most of them. Joints differ in width and depth, and have a level floor of sand. At the
     boundary they are wide, and all slabs are divided: fragments lie apart. Undulations of sand cover low slabs. The
-    default brightness and joints are calibrated to the last images of Mars 2020's landing camera.
+    brightness of slabs and sand, and the width of joints are calibrated to the last images of Mars 2020's landing
+    camera.
     """
 
     fraction: Annotated[Fraction, Field(description="fraction of the ground in patches of bedrock")] = 0.3
@@ -73,8 +75,8 @@ class Outcrop(Parameters):
     slab_m: Annotated[Positive, Field(description="mean width of the large slabs, m")] = 0.8
     height_m: Annotated[NonNegative, Field(description="mean height of the large slabs above the sand, m")] = 0.05
     tilt_deg: Annotated[float, bounded_field(0.0, 30.0, "RMS tilt of the slabs along one axis, deg")] = 4.0
-    joint_m: Annotated[Positive, Field(description="mean half width of the sand-filled joints between slabs, m")] = 0.03
-    log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "mean logarithm of albedo divided by the sand's")] = 0.35
+    joint_m: Annotated[Positive, Field(description="mean half width of the sand-filled joints between slabs, m")] = 0.04
+    log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "mean logarithm of albedo divided by the sand's")] = 0.2
     log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.1
     sand_log_albedo_sd: Annotated[
         float, bounded_field(0.0, 1.0, "the same of the sand between slabs, which varies from patch to patch")

@@ -174,12 +174,12 @@ def add_slabs(
                     sand = wa * a[1] + wb * b[1] + wc * c[1] + wd * d[1]
                     x = (column * step + j) * spacing + wa * a[2] + wb * b[2] + wc * c[2] + wd * d[2]
                     y = (row * step + i) * spacing + wa * a[3] + wb * b[3] + wc * c[3] + wd * d[3]
-                    loose = min(max(1.0 - bedrock / max_slab, 0.0), 1.0)
+                    loose = min(max(1.0 - 2.0 * bedrock / max_slab, 0.0), 1.0)
                     opening = 1.0 + LOOSENESS * loose
                     top, contrast, number, filled = _cut_slab(coarse, x, y, spacing, opening)
                     top += bedrock
                     exposed = 0.0
-                    if number < fractured + (1.0 - fractured) * loose and top + max_fine > 0.0:
+                    if number < fractured + (1.0 - fractured) * loose and filled < 1.0 and top + max_fine > 0.0:
                         fine_top, fine_contrast, _, fine_filled = _cut_slab(fine, x, y, spacing, opening)
                         top += fine_top
                         contrast += fine_contrast
