@@ -137,6 +137,7 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         pebbles=ground.site.pebbles if is_near else None,
+        cover=ground.site.cover if is_near else None,
         horizon=horizon,
         dust_albedo=ground.site.photometry.dust_albedo,
         dust_cover=ground.site.photometry.dust_cover,

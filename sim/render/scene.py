@@ -27,9 +27,9 @@ from marsyard.sim.render.shadows import Footprint, Occluders
 from marsyard.sim.render.sky import Sun
 from marsyard.sim.render.skyline import Relief, Skyline
 from marsyard.sim.render.spline import Terrain
-from marsyard.sim.render.texture import Texture
+from marsyard.sim.render.texture import Cover, Texture
 from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.sites import SitePebbles
+from marsyard.sim.terrain.sites import SiteCover, SitePebbles
 from marsyard.sim.terrain.surface import HEIGHT, UNIFORM
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
@@ -46,6 +46,7 @@ class Scene:
     - relief: relief finer than the terrain's samples; its slopes change the shading, but not normals and range
     - ground_texture, object_texture: albedo variation finer than the terrain's samples
     - pebbles: pebbles on the ground; None without
+    - cover: sharp borders of sand on bedrock; None without
     - horizon: relief on the horizon; None without
     - dust_albedo, dust_cover: albedo of dust, and fraction of the level faces of rocks that it covers
     - caster_diameter_m: diameter of a round body at the camera that casts a shadow, such as a lander
@@ -68,6 +69,7 @@ class Scene:
     ground_texture: Texture = NO_TEXTURE
     object_texture: Texture = NO_TEXTURE
     pebbles: SitePebbles | None = None
+    cover: SiteCover | None = None
     horizon: Relief | None = None
     dust_albedo: float = 0.3
     dust_cover: float = 0.0
@@ -221,6 +223,7 @@ class Scene:
         return Materials(
             RoughGround.of(self.relief),
             PebbleField.of(self.pebbles, self.surface) if self.pebbles is not None else None,
+            Cover.of(self.cover, self.surface) if self.cover is not None else None,
             self.ground_texture.octaves,
             self.object_texture.octaves,
             surfaces,

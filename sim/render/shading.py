@@ -18,7 +18,7 @@ from marsyard.sim.render.shadows import AUREOLE_BEHIND_BODY, VisibleLight
 from marsyard.sim.render.sky import Sky, disc_overlap
 from marsyard.sim.render.skyline import Skyline
 from marsyard.sim.render.spline import Terrain, evaluate
-from marsyard.sim.render.texture import Octaves, log_relative_albedo
+from marsyard.sim.render.texture import Cover, Octaves, log_relative_albedo
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
 MAX_SHARP_FOOTPRINT = 1.2
@@ -69,10 +69,14 @@ class ObjectSurfaces:
 
 @dataclass(frozen=True, eq=False)
 class Materials:
-    """Micro-relief, pebbles, textures of ground and objects, and the objects' surfaces; None where there are none."""
+    """Micro-relief, pebbles, borders of sand, textures of ground and objects, and the objects' surfaces.
+
+    None where there are none.
+    """
 
     relief: RoughGround | None
     pebbles: PebbleField | None
+    cover: Cover | None
     ground_texture: Octaves
     object_texture: Octaves
     objects: ObjectSurfaces | None
@@ -191,7 +195,11 @@ def shade(
         albedo *= dr.exp(pebbles.log_albedo)
     angles = Angles.of(normal, points.direction, light.sun)
     textures = materials.ground_texture, materials.object_texture
-    albedo *= dr.exp(log_relative_albedo(*textures, is_object, texture_position, texture_footprint, strength))
+    texture = log_relative_albedo(*textures, is_object, texture_position, texture_footprint, strength)
+    if materials.cover is not None:
+        brighter = materials.cover.brighten(dr.log(larger(ground.albedo, 1e-6)) + texture)
+        texture += dr.select(is_ground, brighter, 0.0)
+    albedo *= dr.exp(texture)
     # a copy: products in place would change the fraction that is returned
     fraction = Float(visible.sun)
     if light.caster_diameter is not None:

@@ -15,6 +15,8 @@ from jaxtyping import Float as FloatArray
 from marsyard.sim.render.arrays import Values, larger, to_device
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_space
+from marsyard.sim.terrain.sites import SiteCover
+from marsyard.sim.terrain.surface import Surface
 
 #: Mean square of `noise_in_space`.
 NOISE_VARIANCE = 0.0732
@@ -78,6 +80,25 @@ def log_relative_albedo(
     return dr.while_loop(
         (UInt32(0), first, Float(0.0)), lambda octave, cell, total: (octave < count) & (cell > min_cell), add_octave
     )[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Cover:
+    """Sand over bedrock on the device (`marsyard.sim.terrain.sites.SiteCover`); the border is a logarithm of albedo."""
+
+    border: Values
+    contrast: Values
+    softness: Values
+
+    @classmethod
+    def of(cls, cover: SiteCover, ground: Surface) -> Cover:
+        """Copy to the device."""
+        border = ground.log_albedo_moments[0] + cover.border
+        return cls(Float(border), Float(cover.contrast), Float(cover.softness))
+
+    def brighten(self, log_albedo: Values) -> Values:
+        """Compute the increase of the logarithm of the ground's albedo."""
+        return self.contrast * (1.0 + dr.tanh((log_albedo - self.border) / self.softness))
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,19 @@ class SiteTexture(Parameters):
     amplitudes: Annotated[tuple[float, ...], Field(description="amplitude of each octave")]
 
 
+class SiteCover(Parameters):
+    """Sharp borders between bedrock and the sand that covers it, finer than the terrain's samples.
+
+    The albedo of a sample is a mean over sand and bedrock; a point of the ground is either. The logarithm of albedo,
+    with texture, increases by ``contrast (1 + tanh((log albedo - border) / softness))``: 0 on sand, and twice the
+    contrast on bedrock.
+    """
+
+    border: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo at the border divided by the ground's mean")]
+    contrast: Annotated[Fraction, Field(description="half of the increase of the logarithm of albedo of bedrock")]
+    softness: Annotated[Positive, Field(description="change of this logarithm over which sand becomes bedrock")]
+
+
 class SitePebbles(Parameters):
     """Pebbles and granules that are too many and too small for triangles.
 
@@ -87,7 +100,7 @@ class Site(Parameters):
 
     `descent` is the terrain for images of a descent (spacing of metres over kilometres). `ground` is the terrain for
     images of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them. Pebbles
-    are visible at the scale of the ground only.
+    are visible at the scale of the ground only, and so are borders of sand (`cover`).
     """
 
     name: str
@@ -97,6 +110,7 @@ class Site(Parameters):
     ground_texture: SiteTexture
     rock_texture: SiteTexture
     pebbles: SitePebbles | None = None
+    cover: SiteCover | None = None
     descent: TerrainParameters | None = None
     ground: TerrainParameters | None = None
     hills: tuple[Hill, ...] = ()

@@ -21,7 +21,9 @@ _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
 #: the joints, and length of their bends, in sizes; height above the sand over which dust covers a slab, in heights;
 #: fraction of the large slabs that the second generation divides (assumed).
-_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.6, 0.35, 0.6
+_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _BEND_LENGTH, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.15, 0.6, 0.35, 0.6
+#: Mean logarithm of the albedo of sand between slabs, divided by that of other ground (calibrated: see `Outcrop`).
+_SAND_TONE = -0.2
 
 
 class Strata(Parameters):
@@ -58,12 +60,14 @@ class Strata(Parameters):
 
 
 class Outcrop(Parameters):
-    """Patches of bedrock, divided by joints into polygonal slabs with rounded edges, partly below sand.
+    """Patches of bedrock, divided by joints into domed polygonal slabs, partly below sand.
 
     The bedrock is above the sand inside the level set of a smooth random field, and dips below it at the boundary.
     Slabs are cells of a Voronoi diagram with curved borders. Each has its own height, tilt and albedo. A second, finer
-    generation of joints divides most of them. Joints differ in width and depth. Sand, with undulations, fills them
-    where it is higher than their floor.
+    generation of joints divides most of them. Joints differ in width and depth, and have a level floor of sand. At the
+    boundary they are wide, and all slabs are divided: fragments lie apart. Undulations of sand cover low slabs. The
+    brightness of slabs and sand, and the width of joints are calibrated to the last images of Mars 2020's landing
+    camera.
     """
 
     fraction: Annotated[Fraction, Field(description="fraction of the ground in patches of bedrock")] = 0.3
@@ -71,12 +75,12 @@ class Outcrop(Parameters):
     slab_m: Annotated[Positive, Field(description="mean width of the large slabs, m")] = 0.8
     height_m: Annotated[NonNegative, Field(description="mean height of the large slabs above the sand, m")] = 0.05
     tilt_deg: Annotated[float, bounded_field(0.0, 30.0, "RMS tilt of the slabs along one axis, deg")] = 4.0
-    joint_m: Annotated[Positive, Field(description="half width of the sand-filled joints between slabs, m")] = 0.06
+    joint_m: Annotated[Positive, Field(description="mean half width of the sand-filled joints between slabs, m")] = 0.04
     log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "mean logarithm of albedo divided by the sand's")] = 0.2
-    log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.06
+    log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.1
     sand_log_albedo_sd: Annotated[
         float, bounded_field(0.0, 1.0, "the same of the sand between slabs, which varies from patch to patch")
-    ] = 0.15
+    ] = 0.08
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the slabs of both generations."""
@@ -93,10 +97,9 @@ class Outcrop(Parameters):
         # the components of a smooth field have the variance 1/2
         depth = np.sqrt(2.0) * _RISE * (patch - np.quantile(patch, 1.0 - self.fraction))
         bedrock = self.height_m * (np.minimum(depth, 1.0) - np.sqrt(2.0) * _SAND_HEIGHT * sand)
-        sand_tone = np.sqrt(2.0) * self.sand_log_albedo_sd * tone
+        sand_tone = _SAND_TONE + np.sqrt(2.0) * self.sand_log_albedo_sd * tone
         generations = [
-            self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
-            for size, height in zip(_SIZES, _HEIGHTS, strict=True)
+            self._draw_slabs(ground.period_m, size, height, rng) for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
         generations[0].slabs[..., LOG_ALBEDO] += self.log_albedo
         fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
@@ -104,7 +107,7 @@ class Outcrop(Parameters):
         add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, _FRACTURED, edge)
         ground.add(layer)
 
-    def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
+    def _draw_slabs(self, period_m: float, size: float, height: float, rng: Generator) -> Slabs:
         """Draw the slabs of a generation with this size and height relative to the parameters."""
         # a Voronoi cell needs neighbours on all sides
         cells = max(round(period_m / (size * self.slab_m)), 3)
@@ -118,7 +121,7 @@ class Outcrop(Parameters):
             ],
             axis=-1,
         )
-        joint, depth = max(size * self.joint_m, spacing_m), _JOINT_DEPTH * height * self.height_m
+        joint, depth = size * self.joint_m, _JOINT_DEPTH * height * self.height_m
         positions = locate_points(rng.uniform(0.02, 0.98, (cells, cells, 2)))
         return Slabs(
             positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), period_m / cells, joint, depth, rise

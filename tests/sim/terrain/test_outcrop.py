@@ -6,7 +6,7 @@ from jaxtyping import Float32
 
 from marsyard.sim.terrain.landforms import Outcrop, TerrainGround
 from marsyard.sim.terrain.landforms.bedrock import locate_points
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs
+from marsyard.sim.terrain.landforms.kernels.bedrock import DOME, LOOSENESS, Slabs, add_slabs
 
 
 def _apply(**changes: float) -> TerrainGround:
@@ -20,8 +20,8 @@ def _apply(**changes: float) -> TerrainGround:
 def test_slabs_cover_the_specified_fraction_and_rise_above_the_sand(fraction: float) -> None:
     ground = _apply(fraction=fraction, height_m=0.1, tilt_deg=0.0, log_albedo=0.3, log_albedo_sd=0.0)
     is_slab = ground.height > 0.005
-    # 26 x 26 large slabs with patches of 4 m: the area is known to a tenth; about a sixth is joints below the sand
-    assert np.mean(is_slab) == pytest.approx(0.85 * fraction, abs=0.1)
+    # 26 x 26 large slabs with patches of 4 m: the area is known to a tenth; about a third is joints and low slabs
+    assert np.mean(is_slab) == pytest.approx(0.67 * fraction, abs=0.08)
     # the bedrock is 0 to 1 height above the sand, on average over patches about 0.8 with slabs of 0 in the mean
     assert np.median(ground.height[is_slab]) == pytest.approx(0.08, rel=0.35)
     assert np.median(ground.log_albedo[ground.height > 0.05]) == pytest.approx(0.3, rel=0.1)
@@ -63,20 +63,32 @@ def _add_one_slab(slope_x: float, joint_m: float = 0.1) -> Float32[np.ndarray, "
     return height
 
 
-def test_slab_is_a_tilted_plateau_with_rounded_edges() -> None:
+def test_slab_is_a_tilted_dome_between_level_joints() -> None:
     level, tilted = _add_one_slab(0.0), _add_one_slab(0.1)
-    # the cell is the square from 0 to 1.6 m. Numbers of 0.25 give an opening of 0.5: joints with the mean half width
-    assert level[4:29, 4:29] == pytest.approx(0.2)
-    # 0.05 m from the border: half of the joint's width, and a quarter of 3/4 of its depth
-    assert level[16, 1] == pytest.approx(0.2 - 0.75 * 0.5 * 0.25, abs=1e-6)
-    # steps decrease towards the middle: the edge is rounded
-    wide = np.diff(_add_one_slab(0.0, joint_m=0.4)[16, 2:9])
-    assert np.all(np.diff(wide) < 0.0)
+    # The cell is the square from 0 to 1.6 m. At the boundary of the bedrock joints are wider by `LOOSENESS`; numbers of
+    # 0.25 give 3/4 of the mean half width: 0.19 m. From 0.4 m on the slab is level.
+    half_width = 0.75 * 0.1 * (1.0 + LOOSENESS)
+    assert level[8:25, 8:25] == pytest.approx(0.2)
+    # 0.3 m from the border, a quarter of the fall remains
+    assert level[16, 6] == pytest.approx(0.2 - DOME * 0.5 * 0.25**2, abs=1e-6)
+    # a sample at 0.2 m is joint in this part of its width
+    filled = (half_width - 0.175) / 0.05
+    assert level[16, 4] == pytest.approx(0.2 - 0.75 * 0.5 * filled, abs=1e-6)
+    # the floor of the joint is below the sand
+    assert np.all(level[16, :4] == 0.0)
     assert np.all(level[34:, :] == 0.0)
     assert np.all(level[:, 34:] == 0.0)
     # along x, columns are 0.05 m apart
-    assert np.diff(tilted[16, 5:28]) == pytest.approx(0.1 * 0.05, abs=1e-6)
+    assert np.diff(tilted[16, 8:25]) == pytest.approx(0.1 * 0.05, abs=1e-6)
     assert tilted[16, 16] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_joints_are_sand_also_where_their_floor_is_above_the_surroundings() -> None:
+    ground = _apply(fraction=1.0, height_m=0.1, tilt_deg=0.0, log_albedo=0.4, log_albedo_sd=0.0, sand_log_albedo_sd=0.0)
+    high = ground.log_albedo[ground.height > 0.035]
+    # the remaining samples contain the margin of a joint
+    assert np.mean(high > 0.39) > 0.6
+    assert np.mean(high < 0.0) > 0.02
 
 
 def test_joints_differ_in_width() -> None:

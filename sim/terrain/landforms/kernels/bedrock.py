@@ -78,6 +78,9 @@ def add_cracks(
 #: Columns of a slab: height at its point, metres; slopes along x and y; logarithm of albedo; random number from 0 to 1.
 #: The numbers of two slabs give the width of the joint between them.
 HEIGHT, SLOPE_X, SLOPE_Y, LOG_ALBEDO, NUMBER = range(5)
+#: Depth of a slab's edge below its middle, in depths of joints, and width of the fall, in cells; increase of the width
+#: of joints at the boundary of the bedrock (assumed).
+DOME, DOME_EDGE, LOOSENESS = 0.15, 0.25, 1.5
 
 
 class Slabs(NamedTuple):
@@ -99,11 +102,14 @@ class Slabs(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float, float]:
-    """Compute height, logarithm of albedo and number of the slab at x, y (metres), and subtract the joint around it.
+def _cut_slab(
+    generation: Slabs, x: float, y: float, spacing: float, opening: float
+) -> tuple[float, float, float, float]:
+    """Compute height, logarithm of albedo and number of the slab at x, y (metres), and the fraction that is joint.
 
-    The edge is rounded: over the width of the joint, the height rises as a parabola. Joints have 0 to 2 times the mean
-    width; narrow ones are also shallow, so that slabs of several cells are common.
+    A slab is domed: it falls towards its edge as a parabola. The joint around it has a level floor, and a half width of
+    0 to 3 times the mean, narrow ones more often; narrow ones are also shallow, so that slabs of several cells are
+    common. `opening` is a factor of this width. The fraction is the mean over a sample.
     """
     positions, slabs, cell, joint, depth, rise = generation
     count = positions.shape[0] - 2
@@ -114,13 +120,16 @@ def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float, floa
     near = _find_cells(positions, x, y)
     own, other = slabs[near.row, near.column], slabs[near.second_row, near.second_column]
     # uniform from 0 to 1, and equal on both sides of the joint
-    opening = own[NUMBER] + other[NUMBER]
-    opening -= 1.0 if opening >= 1.0 else 0.0
-    t = near.border * cell / max(2.0 * opening * joint, 1e-6)
-    cut = (1.0 - t) ** 2 if t < 1.0 else 0.0
+    number = own[NUMBER] + other[NUMBER]
+    number -= 1.0 if number >= 1.0 else 0.0
+    half_width, border = 3.0 * number * number * joint * opening, near.border * cell
+    inside = min(border + 0.5 * spacing, half_width) - max(border - 0.5 * spacing, -half_width)
+    filled = max(inside / spacing, 0.0)
+    from_edge = 1.0 - near.border / DOME_EDGE
+    dome = DOME * depth * from_edge * from_edge if from_edge > 0.0 else 0.0
     tilt = -cell * (own[SLOPE_X] * near.offset_x + own[SLOPE_Y] * near.offset_y)
-    top = own[HEIGHT] + min(max(tilt, -rise), rise) - min(1.5 * opening, 1.0) * depth * cut
-    return top, own[LOG_ALBEDO], own[NUMBER]
+    cut = max(min(1.5 * number, 1.0) * depth * filled, dome)
+    return own[HEIGHT] + min(max(tilt, -rise), rise) - cut, own[LOG_ALBEDO], own[NUMBER], filled
 
 
 @njit(cache=True, error_model="numpy")
@@ -135,6 +144,8 @@ def add_slabs(
     edge: float,
 ) -> None:
     """Add the slabs of two generations of joints where they rise above the sand.
+
+    Towards the boundary of the bedrock, joints are wider and more slabs are divided: the boundary is loose fragments.
 
     - fields: on a coarser grid of the same extent, shape (rows, rows, 4): mean height of the bedrock above the sand,
       metres; logarithm of albedo of sand between slabs; displacements of the joints along x and y, metres
@@ -163,16 +174,19 @@ def add_slabs(
                     sand = wa * a[1] + wb * b[1] + wc * c[1] + wd * d[1]
                     x = (column * step + j) * spacing + wa * a[2] + wb * b[2] + wc * c[2] + wd * d[2]
                     y = (row * step + i) * spacing + wa * a[3] + wb * b[3] + wc * c[3] + wd * d[3]
-                    top, contrast, number = _cut_slab(coarse, x, y)
+                    loose = min(max(1.0 - 2.0 * bedrock / max_slab, 0.0), 1.0)
+                    opening = 1.0 + LOOSENESS * loose
+                    top, contrast, number, filled = _cut_slab(coarse, x, y, spacing, opening)
                     top += bedrock
                     exposed = 0.0
-                    if number < fractured and top + max_fine > 0.0:
-                        fine_top, fine_contrast, _ = _cut_slab(fine, x, y)
+                    if number < fractured + (1.0 - fractured) * loose and filled < 1.0 and top + max_fine > 0.0:
+                        fine_top, fine_contrast, _, fine_filled = _cut_slab(fine, x, y, spacing, opening)
                         top += fine_top
                         contrast += fine_contrast
+                        filled = max(filled, fine_filled)
                     if top > 0.0:
                         rise = min(top / edge, 1.0)
-                        exposed = rise * rise * (3.0 - 2.0 * rise)
+                        exposed = rise * rise * (3.0 - 2.0 * rise) * (1.0 - filled)
                         height[row * step + i, column * step + j] += top
                     sand *= (1.0 - exposed) * min((bedrock + max_slab) / max_slab, 1.0)
                     log_albedo[row * step + i, column * step + j] += exposed * contrast + sand
