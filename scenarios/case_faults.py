@@ -34,8 +34,8 @@ class SizedFaults(Parameters):
         DETECTOR,
         Field(
             le=0.5,
-            description="fraction of dead pixels, and fraction of hot pixels; those of the cold MER cameras are in effect "
-            "dead pixels alone (hot ones add 6 to 13 of 4096 counts in the mean)",
+            description="fraction of dead pixels, and fraction of hot pixels; in the cold MER cameras in effect dead "
+            "pixels alone (hot ones add 6 to 13 of 4096 counts in the mean)",
         ),
     ] = 0.0
 

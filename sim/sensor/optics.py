@@ -48,10 +48,11 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     """Compute the line spread function: weights of the neighbouring pixels along a row or column, with sum 1.
 
     The Fourier series of the weights is the modulation transfer function up to the Nyquist frequency, truncated to
-    `KERNEL_HALF_SIZE_PX`. It is the product of the functions of a diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x
-    wavelength x f-number (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), of
-    defocus, 2 J1(x) / x with x = pi d f for a uniform disc of diameter d, and optionally of the pixel aperture,
-    sinc(f). Rows and columns are treated as separable, which is an approximation for a round pupil.
+    `KERNEL_HALF_SIZE_PX`. It is the product of the functions of a diffraction-limited circular pupil,
+    2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number (Goodman, Introduction to Fourier
+    Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), of defocus, 2 J1(x) / x with x = pi d f for a uniform disc of
+    diameter d, and optionally of the pixel aperture, sinc(f). Rows and columns are treated as separable, which is an
+    approximation for a round pupil.
     """
     frequency = np.linspace(0.0, 0.5, _FREQUENCIES)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
