@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
+from marsyard.campaigns.store.confirmation_record import locate_record
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import (
@@ -108,6 +109,7 @@ def evaluate_run(
             overall = replace(overall, status=Status.UNVERIFIED)
         return Evaluation(run, sampling, read_evidence(run.record), (), overall)
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
+    evidence = locate_record(evidence, directory)
     joint = read_joint_evidence(evidence if record is None else replace(evidence, record=str(record)))
     design = sampling.with_open_end if evidence.is_confirmation else sampling
     if changes := find_record_changes(run, joint.own, design):

@@ -1,5 +1,7 @@
 """Create the files of a campaign in its folder, and load the campaign of a stored folder."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -27,6 +29,8 @@ def create_files(campaign: Campaign, directory: Path, executor: ExecutorConfig) 
     identity, algorithms = create_identity(definition), describe_algorithms(campaign)
     create_store(directory / ROWS_FILE, {"identity": identity.definition})
     evidence = reserve_confirmation(campaign, directory) if campaign.confirms else classify_run(campaign)
+    if evidence.record:
+        evidence = replace(evidence, record_from_folder=os.path.relpath(evidence.record, directory.resolve()))
     record.write_first_record(
         directory,
         definition,
