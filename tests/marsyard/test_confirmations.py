@@ -76,6 +76,15 @@ def test_exploration_states_in_its_headline_that_it_is_no_confirmation(marsyard:
     assert json.loads((tmp_path / "run" / "report.json").read_text())["verdict"] == "PASS (exploration)"
 
 
+def test_changed_requirement_of_an_exploration_is_stated(marsyard: Command, tmp_path: Path) -> None:
+    changed = "The requirements are not those with which the campaign was started."
+    assert changed not in marsyard("run", "fake.toml", "--jobs", 1, "--out", "run").out
+    assert changed not in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
+    _weaken_requirement(tmp_path / "run")
+    assert changed in " ".join(marsyard("report", "run").out.split())
+    assert changed in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
+
+
 def test_first_confirmation_with_a_committed_record_passes(marsyard: Command, tmp_path: Path) -> None:
     campaign = load_campaign("fake.toml")
     claim = freeze_algorithm(campaign).claim
