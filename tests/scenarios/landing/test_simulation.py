@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from marsyard.scenarios.landing import flight
+from marsyard.scenarios.landing.pair_choice import choose_pair
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.simulation import RenderedFlight, measure
 from marsyard.sim.streams import Streams
@@ -12,7 +13,7 @@ from marsyard.sim.streams import Streams
 
 def test_algorithm_receives_the_laser_reading_with_which_the_pair_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two readings of one instant would differ by their noise, 1 m."""
-    choose_pair, choices = flight.choose_pair, []
+    choices: list[float] = []
 
     def record_choice(poses: Any, ranges_m: Any, *others: Any) -> Any:
         choice = choose_pair(poses, ranges_m, *others)
