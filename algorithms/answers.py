@@ -17,6 +17,8 @@ from marsyard.sim.measurements import MastCalibration
 
 #: Largest asymmetry of a covariance due to rounding, as a fraction of its largest entry.
 _MAX_ASYMMETRY = 1e-9
+#: Largest distance, m, of a returned a-priori site from the given one: three decimals round off at most 0.9 mm.
+_SAME_SITE_M = 1e-3
 
 
 def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
@@ -71,15 +73,24 @@ def _check_span(answer_span: Any, tags_s: Sequence[float] | None) -> tuple[float
     return span
 
 
-def check_site(answer: Any) -> interface.SiteEstimate:
-    """Validate a `SiteEstimate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
+def check_site(answer: Any, apriori_m: Float64[np.ndarray, "3"] | None = None) -> interface.SiteEstimate:
+    """Validate a `SiteEstimate`; return a copy with plain arrays. Raises the same error as `check_velocity`.
+
+    `apriori_m` is the a-priori site, None if unknown. Without convergence no other site is allowed: the helicopter
+    would land there, but HDA-SAFE, which requires safe sites, would not count it.
+    """
     check_type("the answer", answer, interface.SiteEstimate)
     check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
         problem = "is missing" if answer.site_world is None else "is given"
         allowed = "None if and only if the outcome is NO_SAFE_SITE"
         raise bad_answer(f"outcome is {answer.outcome.name}, but site_world {problem}; allowed: {allowed}")
-    return interface.SiteEstimate(answer.outcome, check_numbers("site_world", answer.site_world, (3,)), answer.details)
+    site = check_numbers("site_world", answer.site_world, (3,))
+    distance_m = 0.0 if site is None or apriori_m is None else float(np.linalg.norm(site - apriori_m))
+    if not answer.outcome.converged and distance_m > _SAME_SITE_M:
+        problem = f"site_world is {distance_m:.3g} m from the a-priori site"
+        raise bad_answer(f"outcome is {answer.outcome.name}, but {problem}; allowed: the a-priori site")
+    return interface.SiteEstimate(answer.outcome, site, answer.details)
 
 
 def check_update(answer: Any) -> interface.TargetUpdate:

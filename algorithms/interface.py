@@ -213,8 +213,8 @@ class SiteEstimate:
     """Answer of a landing site estimator.
 
     - outcome: Result of the search
-    - site_world: Site in the world frame of the on-board poses, metres; the a-priori site if the algorithm did not
-      converge, None if there is no safe site
+    - site_world: Site in the world frame of the on-board poses, metres; None if there is no safe site. If the algorithm
+      did not converge, it must be the a-priori site: another one is a BAD_ANSWER.
     - details: Intermediate products for figures and diagnosis, or None
     """
 

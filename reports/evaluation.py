@@ -12,7 +12,10 @@ from typing import Any
 
 import pandas as pd
 
+from marsyard.campaigns.definition.claims import hash_requirements
 from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
+from marsyard.campaigns.store.confirmation_record import locate_record
+from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import (
@@ -108,12 +111,13 @@ def evaluate_run(
             overall = replace(overall, status=Status.UNVERIFIED)
         return Evaluation(run, sampling, read_evidence(run.record), (), overall)
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
+    evidence = locate_record(evidence, directory)
     joint = read_joint_evidence(evidence if record is None else replace(evidence, record=str(record)))
     design = sampling.with_open_end if evidence.is_confirmation else sampling
     if changes := find_record_changes(run, joint.own, design):
         # FAIL in the record remains
         evidence = replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes))
-    evidence = replace(evidence, notes=(*evidence.notes, *joint.notes))
+    evidence = replace(evidence, notes=(*evidence.notes, *joint.notes, *_describe_requirements(run)))
     columns = read_columns(str(run.definition.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the definition of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
@@ -139,6 +143,16 @@ def _mark_unverified(verdict: Verdict, run: StoredRun) -> Verdict:
     """Mark PASS of rows without a chain of hashes: nothing shows that they are those of the cases."""
     is_pass = verdict.status is Status.PASS or verdict.status.is_qualified
     return replace(verdict, status=Status.UNVERIFIED) if run.unverified and is_pass else verdict
+
+
+def _describe_requirements(run: StoredRun) -> tuple[str, ...]:
+    """State that the requirements are not those in the hashes of the rows; empty if they are, or without hashes."""
+    if run.unverified:
+        return ()
+    with readable_store(run.directory / ROWS_FILE) as store:
+        stored = store.about.get("requirements", "")
+    is_changed = stored and stored != hash_requirements(run.requirements)
+    return ("The requirements are not those with which the campaign was started.",) if is_changed else ()
 
 
 def _describe_wrong_rows(run: StoredRun) -> str:

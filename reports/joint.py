@@ -62,10 +62,15 @@ class JointEvidence:
         return joined
 
     def describe_obstacle(self, cases: int) -> str:
-        """Describe an unfinished confirmation, which prevents PASS; empty if all are finished.
+        """Describe a missing entry or an unfinished confirmation, which prevents PASS; empty if all are finished.
 
         cases: number of cases of the run
         """
+        if self.is_confirmation and self.own is None:
+            return (
+                "Earlier results of this claim are unknown: its record of confirmations cannot be found, is damaged, "
+                "or lacks this run. PASS needs the record."
+            )
         if self.own is not None and cases < self.own.cases:
             return (
                 f"The record announces {count(self.own.cases, 'case')} of confirmation {self.own.number}; this folder "
@@ -181,7 +186,10 @@ def read_joint_evidence(evidence: Evidence) -> JointEvidence:
     registration = find_registration_problem(path)
     own = find_own_entry(record, evidence)
     if own is None:
-        problem = registration or f"{UNKNOWN}: {path} does not contain this run."
+        problem = f"{UNKNOWN}: {path} does not contain this run."
+        if not path.is_file():
+            moved = evidence.record_from_folder and f", nor {evidence.record_from_folder} from the folder of the run"
+            problem = f"{UNKNOWN}: the record cannot be found. {path} does not exist{moved}. Put it back there."
         return JointEvidence(is_confirmation=True, registration_problem=problem)
     entries = record.of_claim(own.claim)
     others = [entry for entry in entries if entry.number != own.number]

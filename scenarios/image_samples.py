@@ -40,7 +40,9 @@ class ImageSample:
     metadata: Mapping[str, Any]
 
 
-#: Maximum relative difference between the ranges of two rendered rows that see the same surface.
+#: Maximum relative difference between the ranges of two rendered rows that see the same surface (assumed). Rows of the
+#: descent camera are 0.82 mrad apart: on one surface they differ by less, up to an incidence of 87.6 deg. The mean of
+#: two surfaces that differ by less is wrong by at most 1 %.
 _MAX_RANGE_STEP = 0.02
 
 

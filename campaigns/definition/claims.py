@@ -237,6 +237,11 @@ def requirement_key(requirement: Mapping[str, Any]) -> str:
     return hash_json([requirement.get(name) for name in _REQUIREMENT_KEYS])[:16]
 
 
+def hash_requirements(requirements: Iterable[Mapping[str, Any]]) -> str:
+    """Compute the hash of requirements, in any order."""
+    return hash_json(sorted(map(requirement_key, requirements)))
+
+
 def confirmation_seed(claim: str, head: str) -> int:
     """Compute the seed of a confirmation: 48 bits of a SHA-256.
 

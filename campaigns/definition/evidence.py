@@ -48,6 +48,7 @@ class Evidence:
     - number: number of the confirmation whose seed the run uses; 0 without one
     - claim: identity of the content that is confirmed; empty for other kinds
     - record: file of the record of confirmations; empty for other kinds
+    - record_from_folder: its path from the folder of the run, which is valid after both have moved together
     - registration: why the record was not registered when the run started; empty if it was
     - overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
     - imported_terrain: whether the cases are on an imported DTM, so that no confirmation can use fresh terrains
@@ -60,6 +61,7 @@ class Evidence:
     number: int = 0
     claim: str = ""
     record: str = ""
+    record_from_folder: str = ""
     registration: str = ""
     overlap: float | None = None
     imported_terrain: bool = False
@@ -78,6 +80,7 @@ class Evidence:
                 number=int(stored.get("number", 0)),
                 claim=str(stored.get("claim", "")),
                 record=str(stored.get("record", "")),
+                record_from_folder=str(stored.get("record_from_folder", "")),
                 registration=str(stored.get("registration", "")),
                 overlap=None if overlap is None else float(overlap),
                 imported_terrain=bool(stored.get("imported_terrain", False)),

@@ -29,6 +29,7 @@ from marsyard.campaigns.running.shared_inputs import prepare_inputs
 from marsyard.campaigns.running.stored_campaign import create_files, load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.confirmation_record import locate_record
 from marsyard.campaigns.store.confirmations import extend_confirmation
 from marsyard.campaigns.store.lock import folder_lock, lock_new_folder
 from marsyard.campaigns.store.origin import check_rows
@@ -180,7 +181,7 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
         if not retries and is_complete and not _list_missing_cases(run, store):
             observer.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
-        evidence = Evidence.read(stored.get("evidence"))
+        evidence = locate_record(Evidence.read(stored.get("evidence")), directory)
         if evidence.kind is EvidenceKind.CONFIRMATION and evidence.claim:
             extend_confirmation(evidence, definition.total_cases, repeats=bool(retries))
         session = record.describe_session(command, run.executor.describe(), count)

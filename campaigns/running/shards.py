@@ -103,7 +103,9 @@ def merge_shards(directories: Sequence[Path], target: Path, *, allow_changed: bo
     for directory in directories:
         check_rows(directory)
     with create_folder(target) as folder:
-        create_store(folder / ROWS_FILE, {"identity": identity.definition})
+        with readable_store(directories[0] / ROWS_FILE) as store:
+            about = store.about
+        create_store(folder / ROWS_FILE, about)
         with RowStore(folder / ROWS_FILE) as store:
             for directory in directories:
                 _copy_rows(directory, store)

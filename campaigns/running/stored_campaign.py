@@ -1,5 +1,7 @@
 """Create the files of a campaign in its folder, and load the campaign of a stored folder."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -7,6 +9,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.claims import hash_requirements
 from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.toml_models import key_text, validation_problems
 from marsyard.campaigns.errors import DefinitionError, Problem
@@ -25,8 +28,11 @@ def create_files(campaign: Campaign, directory: Path, executor: ExecutorConfig) 
     """
     definition = campaign.definition
     identity, algorithms = create_identity(definition), describe_algorithms(campaign)
-    create_store(directory / ROWS_FILE, {"identity": identity.definition})
+    requirements = hash_requirements([item.model_dump(mode="json") for item in definition.requirements])
+    create_store(directory / ROWS_FILE, {"identity": identity.definition, "requirements": requirements})
     evidence = reserve_confirmation(campaign, directory) if campaign.confirms else classify_run(campaign)
+    if evidence.record:
+        evidence = replace(evidence, record_from_folder=os.path.relpath(evidence.record, directory.resolve()))
     record.write_first_record(
         directory,
         definition,

@@ -12,6 +12,7 @@ version control, next to the algorithm; entries are never changed or removed. Ki
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -138,6 +139,17 @@ def find_own_entry(record: ConfirmationRecord, evidence: Evidence) -> Confirmati
     """Return the entry of a run; None if the record does not contain it."""
     entries = record.of_claim(evidence.claim)
     return next((entry for entry in entries if entry.number == evidence.number), None)
+
+
+def locate_record(evidence: Evidence, directory: Path) -> Evidence:
+    """Return the evidence of the run in a folder with the file of its record, if the record has moved with the folder.
+
+    The file at its first path precedes: a copy of the record next to a copy of the run can lack later entries.
+    """
+    moved = Path(os.path.normpath(directory.resolve() / evidence.record_from_folder))
+    if not evidence.record_from_folder or Path(evidence.record).is_file() or not moved.is_file():
+        return evidence
+    return replace(evidence, record=str(moved))
 
 
 def list_related_claims(record: ConfirmationRecord, own: Sequence[Confirmation]) -> list[list[Confirmation]]:

@@ -179,6 +179,8 @@ def extend_confirmation(evidence: Evidence, cases: int, *, repeats: bool = False
     repeats: whether crashed cases run again, so that the counts in the record will change
     """
     path = Path(evidence.record)
+    if not path.is_file():
+        raise StoreError(f"the record of confirmations cannot be found: {path} does not exist; put it back there")
     with _open_locked(path) as file:
         record, entry = _find_own_entry(path, file, evidence)
         if cases > entry.cases or repeats:

@@ -24,6 +24,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+from marsyard.campaigns.sampling.dispersions import Derived, Fixed
 from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import check_rows
@@ -113,7 +114,8 @@ def _load_run(run: Path, definition: CampaignDefinition) -> Campaign:
     """Load the campaign of a run. Raises CampaignError if its cases cannot be repeated, or are no random draws."""
     stored = record.read(run)
     if STUDY_KEY in stored or definition.design.kind != "random" or definition.grids:
-        raise CampaignError(f"{run}: its cases are not independent random draws; allowed: a campaign of `marsyard run`")
+        reason = "its cases are not independent random draws"
+        raise CampaignError(f"{run}: {reason}; allowed: a campaign of `marsyard run` whose simulated cases are random")
     if stored.get("state") != "finished" or not definition.requirements:
         reason = "it has no requirement" if stored.get("state") == "finished" else "it is not finished"
         raise CampaignError(f"{run}: {reason}; allowed: a finished campaign with requirements")
@@ -126,7 +128,13 @@ def _load_run(run: Path, definition: CampaignDefinition) -> Campaign:
 def _list_steps(campaign: Campaign, path: str, farthest: float) -> list[RobustVariant]:
     """List the steps of a parameter from its value in the campaign, excluded, to the farthest value."""
     option = f"--parameter {path}={farthest:g}"
-    if path in campaign.definition.dispersions:
+    dispersion = campaign.definition.dispersions.get(path)
+    if isinstance(dispersion, Fixed | Derived):
+        raise CampaignError(
+            f"{option}: dispersions.{path} of the campaign is '{dispersion.distribution}'; allowed: parameters without "
+            "a dispersion. Run the campaign with the value under [parameters] instead"
+        )
+    if dispersion is not None:
         raise CampaignError(
             f"{option}: the parameter is dispersed, so that the stored cases give its robustness; to exceed its "
             "distribution, run the campaign with another one"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.campaign_file import Requirement
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.identity import Identity, create_identity
 from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.errors import CampaignError, unknown_name_message
@@ -34,6 +34,7 @@ from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_ta
 from marsyard.campaigns.studies.point_runner import PointRunner
 from marsyard.campaigns.studies.results import BudgetResult, RareResult, RobustResult, SearchResult
 from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind
+from marsyard.scenarios.interface import HasRecordedCases
 
 Parameters = TypeVar("Parameters")
 Result = TypeVar("Result", bound=RareResult | SearchResult | BudgetResult | RobustResult)
@@ -58,11 +59,28 @@ class StudySession(Generic[Parameters, Result]):
 def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = None) -> Campaign:
     """Return the campaign with the design `adaptive` and at most `max_cases` cases.
 
-    The number of a terrain `in-turn` that does not repeat within the `streams` of the study (one per case by default)
-    belongs to the random streams: it follows their number.
-    Raises CampaignError if a dispersion is neither a standard normal variable nor such a number.
+    - streams: number of random streams of the study, by default one per case
+    Raises CampaignError for recorded cases, and like `_check_dispersions`.
     """
     definition = campaign.definition
+    if isinstance(campaign.scenario, HasRecordedCases):
+        raise CampaignError(
+            f"campaign '{definition.name}' has recorded cases, which no study can draw or change; allowed: simulated "
+            "cases"
+        )
+    _check_dispersions(definition, streams or max_cases)
+    if not campaign.drawn_paths:
+        raise CampaignError(f"campaign '{definition.name}' has no random dispersion")
+    changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
+    # no command: `marsyard run` does not repeat a study
+    return replace(campaign, definition=definition.model_copy(update=changes), command=())
+
+
+def _check_dispersions(definition: CampaignDefinition, streams: int) -> None:
+    """Raise CampaignError if a dispersion is neither a standard normal variable nor the number of a terrain `in-turn`.
+
+    Such a number belongs to the random streams, and follows their number; it must not repeat within all of them.
+    """
     sequences = list_sequences(definition.model_dump(mode="json")["dispersions"])
     for path, dispersion in definition.dispersions.items():
         remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
@@ -73,15 +91,10 @@ def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = N
             raise CampaignError(f"dispersions.{path}: {reason}; {remedy}")
         if isinstance(dispersion, CyclicInteger):
             inputs = {name: value_at(definition.parameters, name) for name in dispersion.names}
-            size, used = dispersion.insert_values(inputs).size, streams or max_cases
-            if size < used:
-                reason = f"the {size} values of the distribution 'in-turn' repeat within {used} cases"
+            size = dispersion.insert_values(inputs).size
+            if size < streams:
+                reason = f"the {size} values of the distribution 'in-turn' repeat within {streams} cases"
                 raise CampaignError(f"dispersions.{path}: {reason}; extend its range, {remedy}")
-    if not campaign.drawn_paths:
-        raise CampaignError(f"campaign '{definition.name}' has no random dispersion")
-    changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
-    # no command: `marsyard run` does not repeat a study
-    return replace(campaign, definition=definition.model_copy(update=changes), command=())
 
 
 def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
@@ -118,13 +131,14 @@ def start_study(
 def continue_study(directory: Path, session: StudySession[Any, Result], additional_cases: int = 0) -> Result:
     """Continue a stored study; the session's parameters replace the stored ones, and the limit of cases increases.
 
-    Raises CampaignError if the program has changed.
+    Raises CampaignError if the program has changed, or the study cannot have the additional cases.
     """
     with folder_lock(directory):
         definition = record.stored_definition(directory)
         if additional_cases:
             blocks = (*definition.appended, additional_cases)
             definition = definition.model_copy(update={"appended": blocks})
+            _check_dispersions(definition, definition.total_cases)
         campaign = load_stored_campaign(directory, definition)
         check_identity(campaign, directory)
         check_rows(directory)

@@ -198,7 +198,7 @@ STREAM_RULES = replace(
 )
 LANDING_RULES = SuiteRules(
     measurements=inputs.landing,
-    check=lambda answer, _: check_site(answer),
+    check=lambda answer, measurements: check_site(answer, measurements.apriori_site_world),
     is_valid=lambda estimate: estimate.outcome.converged,
     describe=lambda estimate: str(estimate.outcome.name),
     failures=", ".join(outcome.name for outcome in SiteOutcome if not outcome.converged),

@@ -36,6 +36,7 @@ class LandingFlight:
     poses: tuple[PoseMeasurement, PoseMeasurement]  #: estimates of the on-board filter
     up_body: Float64[np.ndarray, "3"]  #: up vector of the inclinometers at the first image, body axes
     transit: Transit | None = None  #: the helicopter flight; None if the parameters define the poses
+    first: int = 0  #: number of the first image among those of the flight
 
     @classmethod
     def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> LandingFlight:
@@ -70,15 +71,15 @@ class LandingFlight:
             range_along(surface, position, axis, MAX_RANGE_HEIGHTS * height)
             for position, axis in zip(motion.positions_m, motion.attitudes.apply(laser.axis), strict=True)
         ]
-        readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
-        ranges = add_range_faults(p.faults, readings.values, height)[received_indices]
+        readings = laser.read(np.array(true_ranges), streams.generator("laser noise"))
+        ranges = add_range_faults(p.faults, readings, height)[received_indices]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
         choice = choose_pair(
             [transit.pose(int(index)) for index in received_indices], ranges, calibrated, p.pair, height
         )
         first, second = int(received_indices[choice.first]), int(received_indices[choice.second])
         poses = (transit.pose(first), transit.pose(second))
-        return cls((motion.state(first), motion.state(second)), poses, transit.up_body(first), transit)
+        return cls((motion.state(first), motion.state(second)), poses, transit.up_body(first), transit, first)
 
     @property
     def position_error_m(self) -> Float64[np.ndarray, "3"]:

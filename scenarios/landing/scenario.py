@@ -60,7 +60,8 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         shared = {**conditions(case, measurements), **provenance}
 
         def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
-            return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
+            check = partial(check_site, apriori_m=measurements.apriori_site_world)
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check, measurements)
 
         def score_answer(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
             # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure

@@ -44,8 +44,10 @@ def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, str
     is no range.
     """
     unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-    reading = unit.readings(np.zeros(1), np.array([pair.range_along_m(unit.axis)]), streams.generator("laser noise"))
-    slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
+    # one reading at each image: its noise is that with which the flight chose the pair
+    count = 1 if flight.transit is None else flight.transit.times_s.size
+    ranges = unit.read(np.full(count, pair.range_along_m(unit.axis)), streams.generator("laser noise"))
+    slant = float(add_range_faults(p.faults, ranges, p.height_m)[flight.first])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
     camera = p.detector.delivered_camera(calibrated)
     first, second = (

@@ -19,8 +19,8 @@ _CASE = (
     outcome("matches", "matched points of all image pairs"),
     outcome("pairs_matched", "pairs of images with enough matches"),
     error("outlier_fraction", "fraction of the matches that disagree with the essential matrix"),
-    error("residual_median_px", "median distance of the matches from the poses' epipolar lines"),
-    error("residual_90_percent_px", "90 % quantile of the distance from the epipolar lines"),
+    error("residual_median_px", "median distance of the matches from the poses' epipolar curves"),
+    error("residual_90_percent_px", "90 % quantile of the distance from the epipolar curves"),
     error("residual_worst_pair_px", "median distance of the worst pair"),
 )
 

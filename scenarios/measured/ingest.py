@@ -26,7 +26,9 @@ from marsyard.sim.camera import CameraModel
 #: Maximum number of rows that a detector sums, and maximum relative deviation of the ratio of the focal lengths from a
 #: whole number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
-#: Difference below which a true velocity is the same measurement as the velocity of an interval, m/s.
+#: Difference below which a true velocity is the same measurement as the velocity of an interval, m/s (assumed): three
+#: decimals of both components round off at most 0.7 mm/s. Two measurements that differ by 0.1 m/s (RMS, each axis) are
+#: this near with the probability 1 - exp(-(0.001 / 0.1)^2 / 2) = 5e-5.
 _EQUAL_M_S = 1e-3
 #: Default description of a campaign, by task.
 _DESCRIPTIONS = {

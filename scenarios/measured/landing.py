@@ -76,7 +76,8 @@ class MeasuredLandingScenario(TypedScenario[MeasuredLandingParameters]):
         }
 
         def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
-            return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
+            check = partial(check_site, apriori_m=measurements.apriori_site_world)
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check, measurements)
 
         def score(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
             answer = runs[algorithm].answer

@@ -84,8 +84,6 @@ class RangingUnit:
     """
 
     parameters: RangingParameters
-    sampling: Sampling
-    clock: Clock
     scale: float
     axis: Vector
 
@@ -93,23 +91,19 @@ class RangingUnit:
     def draw(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
         """Draw the constant errors."""
         p = parameters
-        # another number of draws would change the random values of a laser
-        rate_hz, errors = (p.rate_hz, p.clock) if isinstance(p, RadarParameters) else (1.0, ClockParameters())
-        sampling, clock = Sampling.draw(rate_hz, rng), Clock.draw(errors, rng)
         scale = 1.0 + p.scale_error * float(rng.standard_normal())
         tilt = np.radians(p.boresight_deg) * np.append(rng.standard_normal(2), 0.0)
-        return cls(p, sampling, clock, scale, np.asarray(Rotation.from_rotvec(tilt).apply(DOWN)))
+        return cls(p, scale, np.asarray(Rotation.from_rotvec(tilt).apply(DOWN)))
 
-    def readings(self, times_s: Times, ranges_m: Float64[np.ndarray, "n"], rng: Generator) -> Readings:
-        """Simulate readings of true ranges (infinite without a return) at true times."""
+    def read(self, ranges_m: Float64[np.ndarray, "n"], rng: Generator) -> Float64[np.ndarray, "n"]:
+        """Simulate the readings of true ranges (infinite without a return); NaN marks a missing reading."""
         p = self.parameters
-        tags = self.clock.tags(times_s, rng)
-        relative = self.scale + p.noise * rng.standard_normal(times_s.size)
-        values = ranges_m * relative + p.noise_m * rng.standard_normal(times_s.size)
+        relative = self.scale + p.noise * rng.standard_normal(ranges_m.size)
+        values = ranges_m * relative + p.noise_m * rng.standard_normal(ranges_m.size)
         if p.count_m > 0.0:
             values = p.count_m * np.rint(values / p.count_m)
         valid = (ranges_m >= p.min_range_m) & (ranges_m <= p.max_range_m)
-        return Readings(tags, np.where(valid, values, np.nan))
+        return np.where(valid, values, np.nan)
 
 
 def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m: float) -> float:
@@ -165,17 +159,15 @@ class RadarAltimeter:
 
     parameters: RadarParameters
     surface: Surface
+    sampling: Sampling
+    clock: Clock
     unit: RangingUnit
 
     @classmethod
     def draw(cls, parameters: RadarParameters, surface: Surface, rng: Generator) -> RadarAltimeter:
         """Draw the constant errors."""
-        return cls(parameters, surface, RangingUnit.draw(parameters, rng))
-
-    @property
-    def sampling(self) -> Sampling:
-        """Sampling times."""
-        return self.unit.sampling
+        sampling, clock = Sampling.draw(parameters.rate_hz, rng), Clock.draw(parameters.clock, rng)
+        return cls(parameters, surface, sampling, clock, RangingUnit.draw(parameters, rng))
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
         """Measure the range to the nearest ground within the beam at each true time."""
@@ -187,7 +179,8 @@ class RadarAltimeter:
             first_return(self.surface, position, axis, float(half_angle), p.max_range_m)
             for position, axis, half_angle in zip(motion.positions_m, axes, half_angles, strict=True)
         ]
-        return self.unit.readings(times_s, np.array(ranges, dtype=np.float64), rng)
+        tags = self.clock.tags(times_s, rng)
+        return Readings(tags, self.unit.read(np.array(ranges, dtype=np.float64), rng))
 
 
 def first_return(

@@ -51,7 +51,6 @@ class Gps:
         """Draw the errors for use within a time span."""
         p = parameters
         sd = np.array([p.horizontal_wander_m, p.horizontal_wander_m, p.vertical_wander_m])
-        rng.random()  # another number of draws would change the random values
         clock = Clock.draw(p.clock, rng)
         return cls(p, clock, GaussMarkov.draw(sd, p.correlation_s, span_s, rng))
 

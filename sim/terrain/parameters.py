@@ -37,7 +37,8 @@ class TerrainParameters(Parameters):
         float, bounded_field(-2.0, 1.0, "mean logarithm of the albedo of this sand divided by the ground's")
     ] = -0.4
     craters_wear_albedo: Annotated[
-        bool, Field(description="whether sand and ejecta fade as craters wear; otherwise they do not depend on the age")
+        bool,
+        Field(description="whether sand and ejecta fade as craters wear, and half of the craters below 30 m cluster"),
     ] = False
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0

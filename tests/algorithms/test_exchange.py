@@ -318,6 +318,11 @@ def test_python_answers_are_validated() -> None:
         assert error.value.fault is Fault.BAD_ANSWER
     with pytest.raises(AlgorithmError, match="NO_SAFE_SITE"):
         check_site(SiteEstimate(SiteOutcome.NO_SAFE_SITE, np.zeros(3)))
+    apriori_m = np.array([3.0, 4.0, 0.2])
+    rounded = SiteEstimate(SiteOutcome.NO_MOTION, apriori_m + 0.0005)
+    assert check_site(rounded, apriori_m).outcome is SiteOutcome.NO_MOTION
+    with pytest.raises(AlgorithmError, match=r"NO_MOTION, but site_world is 2 m from .*; allowed: the a-priori site"):
+        check_site(SiteEstimate(SiteOutcome.NO_MOTION, apriori_m + np.array([0.0, 2.0, 0.0])), apriori_m)
 
 
 def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ ATTEMPTS: list[tuple[Attempt, Expected, str]] = [
     (rename_a_copy_and_its_texts, [FAIL], "joint evidence of the confirmations 1, 2 of this claim"),
     (rename_a_copy_and_change_a_width, [OTHER_CLAIMS], "Other claims: 1: fake"),
     (weaken_the_requirement_in_a_copy, [OTHER_CLAIMS], "Other claims: 1: fake"),
-    (edit_the_record, [UNREGISTERED, INVALID, UNREGISTERED], "is not the beginning of"),
+    (edit_the_record, [UNREGISTERED, INVALID, INSUFFICIENT], "is not the beginning of"),
     (shorten_the_record, [UNREGISTERED], "is not the beginning of"),
     (stop_a_bad_run, [INSUFFICIENT, INVALID], "Confirmation 2 was started on"),
     (reuse_a_seed, [FAIL, INSUFFICIENT], "resulted in FAIL, which is final"),

@@ -76,6 +76,15 @@ def test_exploration_states_in_its_headline_that_it_is_no_confirmation(marsyard:
     assert json.loads((tmp_path / "run" / "report.json").read_text())["verdict"] == "PASS (exploration)"
 
 
+def test_changed_requirement_of_an_exploration_is_stated(marsyard: Command, tmp_path: Path) -> None:
+    changed = "The requirements are not those with which the campaign was started."
+    assert changed not in marsyard("run", "fake.toml", "--jobs", 1, "--out", "run").out
+    assert changed not in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
+    _weaken_requirement(tmp_path / "run")
+    assert changed in " ".join(marsyard("report", "run").out.split())
+    assert changed in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
+
+
 def test_first_confirmation_with_a_committed_record_passes(marsyard: Command, tmp_path: Path) -> None:
     campaign = load_campaign("fake.toml")
     claim = freeze_algorithm(campaign).claim
@@ -127,9 +136,40 @@ def test_unregistered_record_is_stated(marsyard: Command, tmp_path: Path) -> Non
     assert "PASS (unregistered)" in page
     assert marsyard("dashboard", tmp_path, "--out", "site").status == 0
     assert "PASS (unregistered)" in (tmp_path / "site" / "index.html").read_text()
-    # without the record there is no entry of the run
+
+
+def test_record_is_found_after_it_moved_with_the_run(
+    marsyard: Command, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    assert confirm(marsyard, "run-1") == (0, ["PASS"])
+    moved = tmp_path_factory.mktemp("elsewhere") / "project"
+    shutil.copytree(tmp_path, moved)
     (tmp_path / RECORD).unlink()
-    assert marsyard("report", "run-1").status == 4
+    assert marsyard("report", moved / "run-1").status == 0
+    # a later result is added to the moved record
+    assert marsyard("append", moved / "run-1", 5, "--jobs", 1).status == 0
+    assert read_record(moved / RECORD).confirmations[0].cases == 15
+
+
+def test_verdict_without_its_record_is_no_pass(
+    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """FAIL of an earlier confirmation is final; without the record it is unknown."""
+    with monkeypatch.context() as patch:
+        patch.setenv(*BAD_LUCK)
+        assert confirm(marsyard, "run-1") == (1, ["FAIL"])
+    commit_all(tmp_path)
+    assert confirm(marsyard, "run-2", "-n", 20) == (1, ["FAIL"])
+    (tmp_path / RECORD).unlink()
+    output = marsyard("report", "run-2")
+    assert (output.status, read_statuses(tmp_path / "run-2")) == (3, ["INSUFFICIENT"])
+    places = f"{tmp_path / RECORD} does not exist, nor ../{RECORD} from the folder of the run"
+    assert f"the record cannot be found. {places}" in " ".join(output.text.split())
+    # a record without the entry of the run
+    create_record(tmp_path / RECORD)
+    output = marsyard("report", "run-2")
+    assert (output.status, read_statuses(tmp_path / "run-2")) == (3, ["INSUFFICIENT"])
+    assert f"{tmp_path / RECORD} does not contain this run" in " ".join(output.text.split())
 
 
 def test_stopped_confirmation_is_repeated_with_the_same_cases(marsyard: Command, tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.definition.loading import create_campaign, load_campaign
-from marsyard.campaigns.errors import DefinitionError
+from marsyard.campaigns.errors import CampaignError, DefinitionError
+from marsyard.campaigns.studies.runner import prepare_campaign
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.scenarios.conformance import inputs
 from tests.command import run_command
@@ -87,6 +88,8 @@ def test_recorded_cases_are_run_once(tmp_path: Path, change: dict[str, Any], mes
     status, output = run_command("run", str(tmp_path / "out" / "campaign.toml"), "--confirm")
     assert status == 2
     assert "recorded cases are the same for every seed" in " ".join(output.split())
+    with pytest.raises(CampaignError, match="has recorded cases, which no study can draw or change"):
+        prepare_campaign(load_campaign(str(tmp_path / "out" / "campaign.toml")), 2)
     definition = {"scenario": "measured-velocity", "dispersions": change.get("dispersions", {})}
     assert "recorded cases are not random draws" in read_sampling_design(definition).no_probability_reason
 

@@ -15,8 +15,9 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.sampling.study_points import NEW_STREAM, POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
+from marsyard.campaigns.studies.rare import continue_rare, start_rare
 from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
-from marsyard.campaigns.studies.results import SearchParameters
+from marsyard.campaigns.studies.results import RareParameters, SearchParameters
 from marsyard.campaigns.studies.runner import prepare_campaign
 from marsyard.campaigns.studies.search import start_search
 from marsyard.scenarios.systems import systems
@@ -106,6 +107,16 @@ def test_number_in_turn_that_selects_no_terrain_is_rejected(tmp_path: Path) -> N
     campaign = load_campaign(str(write_campaign(tmp_path, dispersions=dispersions)))
     with pytest.raises(CampaignError, match=r"dispersions\.bank_seed: is a distribution 'in-turn' of a number that"):
         prepare_campaign(campaign, 100)
+
+
+def test_additional_cases_do_not_repeat_terrains(tmp_path: Path) -> None:
+    """The study has at most 110 cases, and 110 terrains."""
+    parameters = RareParameters("velocity", 0.5, samples=50, replicates=(2,), random_cases=(10,))
+    start_rare(
+        load_fake_campaign(tmp_path, 109), parameters, 100, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
+    )
+    with pytest.raises(CampaignError, match="the 110 values of the distribution 'in-turn' repeat within 111 cases"):
+        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), random_cases=1)
 
 
 def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:

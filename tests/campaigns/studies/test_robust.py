@@ -349,6 +349,18 @@ def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[st
     assert not (finished_run / "robust").exists()
 
 
+@pytest.mark.parametrize("dispersion", ['"fixed", value = 2.0', '"derived", formula = "2.0"'])
+def test_value_that_the_campaign_sets_by_a_dispersion_is_rejected(tmp_path: Path, dispersion: str) -> None:
+    text = CAMPAIGN.replace("[dispersions]", f"[dispersions]\nbeta = {{ distribution = {dispersion} }}")
+    (tmp_path / "campaign.toml").write_text(text)
+    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
+    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    result = CliRunner().invoke(app, ["robust", str(tmp_path / "run"), "--parameter", "beta=1"])
+    distribution = dispersion.split(",")[0].strip('"')
+    message = f"--parameter beta=1: dispersions.beta of the campaign is '{distribution}'; allowed: parameters without"
+    assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
+
+
 def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
     lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
     table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'

@@ -144,3 +144,11 @@ def test_pixel_without_good_neighbours_is_unchanged() -> None:
     counts[2, 2] = 99
     assert fill_bad_pixels(counts, is_bad)[2, 2] == 99
     assert fill_bad_pixels(counts, is_bad)[1, 1] == 7
+
+
+@pytest.mark.parametrize(("name", "mean_dn"), [("mer-descent-flown", 6), ("mer-navcam", 13), ("mer-hazcam", 13)])
+def test_hot_pixels_of_the_cold_mer_cameras_add_few_counts(name: str, mean_dn: int) -> None:
+    """The numbers are those of the description of the fault `bad_pixels`; full scale is 4096 counts."""
+    p = preset(name).detector
+    charge = p.defects.hot_e_s * p.dark_growth * dark_seconds(p, 1024)
+    assert np.mean(charge) / p.gain_e_dn == pytest.approx(mean_dn, abs=0.5)

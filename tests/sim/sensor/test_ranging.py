@@ -193,8 +193,8 @@ def test_laser_measures_slant_range_along_its_axis() -> None:
 def test_laser_has_no_reading_outside_its_range() -> None:
     no_errors = LaserParameters(noise_m=0.0, count_m=0.0)
     unit = RangingUnit.draw(no_errors, np.random.default_rng(0))
-    readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
-    np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
+    readings = unit.read(np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
+    np.testing.assert_array_equal(readings, [10.0, np.nan, np.nan])
 
 
 def test_boresight_error_has_the_specified_deviation() -> None:
