@@ -189,8 +189,8 @@ def _add_rover(scene: Scene, request: ImageRequest, ground: views.SiteGround) ->
     x, y, _ = world_from_rover.translation
     settled = settle(MER, ground.surface, float(x), float(y), math.radians(request.azimuth_deg))
     stance = replace(settled, world_from_rover=world_from_rover)
-    azimuth, elevation, steering = Streams(request.seed, "render", 0).generator("rover pose").uniform(
-        *np.radians(ROVER_ANGLES_DEG)
+    azimuth, elevation, steering = (
+        Streams(request.seed, "render", 0).generator("rover pose").uniform(*np.radians(ROVER_ANGLES_DEG))
     )
     rover = rover_objects(MER, stance, MER_MAST, azimuth, elevation, steering_rad=steering)
     return scene.with_objects(Objects.join([scene.objects, rover]))

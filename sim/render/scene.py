@@ -210,7 +210,9 @@ class Scene:
             dust_albedo = (1.0 - covered) * objects.albedo + covered * self.dust_albedo
             # only rocks and rovers with texture have grain
             sizes = 0.5 * (objects.bounds[:, 3:5] - objects.bounds[:, :2]).sum(axis=1)
-            sizes = np.where(objects.is_rock, sizes, WRINKLED_M * objects.is_rover) * bool(self.object_texture.amplitudes)
+            sizes = np.where(objects.is_rock, sizes, WRINKLED_M * objects.is_rover) * bool(
+                self.object_texture.amplitudes
+            )
             surfaces = ObjectSurfaces(
                 vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
                 to_device(Int32, objects.body_of_triangle),

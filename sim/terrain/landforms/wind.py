@@ -31,7 +31,9 @@ class Dunes(Parameters):
         float, Field(ge=0.3, le=20.0, description="length over which the spacing persists, wavelengths")
     ] = 1.5
     albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
-    sharpness: Annotated[Fraction, Field(description="0: round crests of dunes, 1: peaked ones of coarse ripples")] = 0.0
+    sharpness: Annotated[Fraction, Field(description="0: round crests of dunes, 1: peaked ones of coarse ripples")] = (
+        0.0
+    )
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the dunes."""

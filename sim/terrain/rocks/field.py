@@ -342,7 +342,9 @@ def _draw_positions(
         return placed_positions
     occupied = np.column_stack([placed_positions, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
-    random_positions = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, parameters.fragments, rng)
+    random_positions = place_discs(
+        radius[count:], occupied, density, period_m, cell, MAX_TRIES, parameters.fragments, rng
+    )
     n_unplaced = int(np.count_nonzero(np.isnan(random_positions[:, 0])))
     if n_unplaced:
         total = len(random_positions)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 #: Power of a uniform number that selects the larger rock of a fragment from those sorted by size, minimum ratio of the
 #: radii, and mean distance of a fragment from the larger rock's outline, in radii of that rock (assumed).
-PARENT_POWER, MIN_PARENT, SPREAD = 4.0, 3.0, 0.8
+PARENT_POWER, MIN_PARENT, SPREAD = 2.5, 3.0, 0.6
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -124,21 +124,26 @@ def place_discs(
         entries = _list_disc(grid, disc, entries)
     positions = np.full((radii.size, 2), np.nan)
     for n in range(radii.size):
-        is_fragment = fragments > 0.0 and rng.random() < fragments
+        first = occupied.shape[0]
+        is_fragment = (
+            fragments > 0.0
+            and rng.random() < fragments
+            and n > 0
+            # the discs are ordered by size: the first one is the largest
+            and grid.discs[first, 2] > MIN_PARENT * radii[n]
+        )
         for _ in range(max_tries):
             x, y = rng.random() * period, rng.random() * period
             i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
             if is_fragment:
-                # the discs are ordered by size
-                parent = occupied.shape[0] + int(rng.random() ** PARENT_POWER * n)
-                # a rock without a much larger one, or without a free position next to it, is no fragment
-                is_fragment = n > 0 and grid.discs[parent, 2] > MIN_PARENT * radii[n]
-                if is_fragment:
-                    angle = 2.0 * math.pi * rng.random()
-                    away = radii[n] + grid.discs[parent, 2] * (1.0 - SPREAD * math.log(1.0 - rng.random()))
-                    x = (grid.discs[parent, 0] + away * math.cos(angle)) % period
-                    y = (grid.discs[parent, 1] + away * math.sin(angle)) % period
-            if not is_fragment and rows > 1 and rng.random() * max_density > density[i, j]:
+                parent = first + int(rng.random() ** PARENT_POWER * n)
+                if grid.discs[parent, 2] <= MIN_PARENT * radii[n]:
+                    continue
+                angle = 2.0 * math.pi * rng.random()
+                away = radii[n] + grid.discs[parent, 2] * (1.0 - SPREAD * math.log(1.0 - rng.random()))
+                x = (grid.discs[parent, 0] + away * math.cos(angle)) % period
+                y = (grid.discs[parent, 1] + away * math.sin(angle)) % period
+            elif rows > 1 and rng.random() * max_density > density[i, j]:
                 continue
             if _is_free(grid, x, y, radii[n]):
                 positions[n, 0], positions[n, 1] = x, y
