@@ -32,8 +32,8 @@ from marsyard.sim.terrain.imported import embed
 
 #: Radiance factor that maps to full scale (65535) without a detector model.
 FULL_SCALE_RADIANCE_FACTOR = 1.0
-#: Minimum and maximum azimuth and elevation of the mast and steering angle of the front wheels in hazard images, degrees
-#: (assumed).
+#: Minimum and maximum azimuth and elevation of the mast, and steering angle of the front wheels, in hazard images,
+#: degrees (assumed).
 ROVER_ANGLES_DEG = ((-120.0, -30.0, -10.0), (120.0, 10.0, 10.0))
 #: Maximum height of the camera above the ground, m.
 MAX_ALTITUDE_M = 20000.0
@@ -189,9 +189,8 @@ def _add_rover(scene: Scene, request: ImageRequest, ground: views.SiteGround) ->
     x, y, _ = world_from_rover.translation
     settled = settle(MER, ground.surface, float(x), float(y), math.radians(request.azimuth_deg))
     stance = replace(settled, world_from_rover=world_from_rover)
-    azimuth, elevation, steering = (
-        Streams(request.seed, "render", 0).generator("rover pose").uniform(*np.radians(ROVER_ANGLES_DEG))
-    )
+    rng = Streams(request.seed, "render", 0).generator("rover pose")
+    azimuth, elevation, steering = np.radians(rng.uniform(*np.array(ROVER_ANGLES_DEG))).tolist()
     rover = rover_objects(MER, stance, MER_MAST, azimuth, elevation, steering_rad=steering)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 

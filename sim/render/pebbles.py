@@ -3,10 +3,10 @@
 The number of pebbles larger than D is in proportion to a power of D. Each grid, turned against the others, contains the
 pebbles of one octave of the diameter; its cells are twice the largest diameter wide. A hash of the cell decides whether
 it contains a pebble, and its position, diameter, outline, height and albedo. Pebbles are many where the ground is
-darker than its mean (lag in hollows, coarse grains on crests), and rare where it is brighter (dust); they are many in
-rough surface units, and rare in smooth ones. Like texture, pebbles belong to the ground: they change normals, albedo and shadows, but not the range. A pixel has one ray and sees means over its
-footprint: outlines are blurred, normals of small pebbles flattened, and pebbles fade where they become smaller than a
-pixel.
+darker than its mean (lag in hollows, coarse grains on crests), and rare where it is brighter (dust). They are many in
+rough surface units, and rare in smooth ones. Like texture, pebbles belong to the ground: they change normals, albedo
+and shadows, but not the range. A pixel has one ray and sees means over its footprint: outlines are blurred, normals of
+small pebbles flattened, and pebbles fade where they become smaller than a pixel.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.objects import Objects
 
-#: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast, without dust:
-#: matt, assumed; dark, because parts do not hide the light of the sky from each other.
+#: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast, without
+#: dust: matt, assumed; dark, because parts do not hide the light of the sky from each other.
 ALBEDOS = {"deck": 0.1, "body": 0.09, "wheel": 0.08, "mast": 0.25}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3

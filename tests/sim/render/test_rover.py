@@ -1,5 +1,7 @@
 """Tests of the rendered rover: shape, pose and shadow."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -81,12 +83,8 @@ def test_deck_has_gaps_between_its_panels_and_carries_antennas() -> None:
 def test_only_front_wheels_turn() -> None:
     stance, steering = settle(MER, Plane(), 0.0, 0.0, EAST), 0.2
     straight, turned = (rover_objects(MER, stance, MER_MAST, 0.0, 0.0, steering_rad=angle) for angle in (0.0, steering))
-    has_moved = [
-        not np.allclose(
-            *(item.triangles[item.first_triangle[n] : item.first_triangle[n + 1]] for item in (straight, turned))
-        )
-        for n in range(len(straight))
-    ]
+    bodies = list(pairwise(straight.first_triangle))
+    has_moved = [not np.allclose(straight.triangles[a:b], turned.triangles[a:b]) for a, b in bodies]
     # deck, body, wheels in the order of `WHEELS`, mast
     assert has_moved == [False, False, True, False, False, True, False, False, False]
     wheel = turned.triangles[turned.first_triangle[2] : turned.first_triangle[3]].reshape(-1, 3)
