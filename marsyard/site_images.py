@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -20,7 +20,7 @@ from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name,
 from marsyard.scenarios.visible_rocks import add_unresolved_rocks, smallest_rock_rad
 from marsyard.sim import sensor
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics.rover import RoverParameters, Stance
+from marsyard.sim.dynamics.rover import MER, settle
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
@@ -32,6 +32,9 @@ from marsyard.sim.terrain.imported import embed
 
 #: Radiance factor that maps to full scale (65535) without a detector model.
 FULL_SCALE_RADIANCE_FACTOR = 1.0
+#: Minimum and maximum azimuth and elevation of the mast, and steering angle of the front wheels, in hazard images,
+#: degrees (assumed).
+ROVER_ANGLES_DEG = ((-120.0, -30.0, -10.0), (120.0, 10.0, 10.0))
 #: Maximum height of the camera above the ground, m.
 MAX_ALTITUDE_M = 20000.0
 
@@ -182,9 +185,13 @@ def _add_rover(scene: Scene, request: ImageRequest, ground: views.SiteGround) ->
         ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0
     )
     world_from_rover = rigid(camera.rotation, camera.apply(-np.array(position_on_rover)))
-    stance = Stance(world_from_rover, differential_rad=0.0, bogies_rad=(0.0, 0.0), gaps_m=np.zeros(6))
-    # the mast points straight ahead
-    rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
+    # the joints follow the ground; each seed has its own directions of mast and front wheels
+    x, y, _ = world_from_rover.translation
+    settled = settle(MER, ground.surface, float(x), float(y), math.radians(request.azimuth_deg))
+    stance = replace(settled, world_from_rover=world_from_rover)
+    rng = Streams(request.seed, "render", 0).generator("rover pose")
+    azimuth, elevation, steering = np.radians(rng.uniform(*np.array(ROVER_ANGLES_DEG))).tolist()
+    rover = rover_objects(MER, stance, MER_MAST, azimuth, elevation, steering_rad=steering)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 
 

@@ -138,6 +138,11 @@ class Objects:
         return np.asarray((self.names >= 0) & (self.names < FIRST_MESH_NUMBER))
 
     @property
+    def is_rover(self) -> Bool[np.ndarray, "bodies"]:
+        """Mark the bodies of rovers."""
+        return np.asarray(self.names < 0)
+
+    @property
     def mounds(self) -> Float64[np.ndarray, "mounds 4"]:
         """Mounds that hide the sky: x, y of the centre, radius, and z of the top.
 

@@ -3,10 +3,10 @@
 The number of pebbles larger than D is in proportion to a power of D. Each grid, turned against the others, contains the
 pebbles of one octave of the diameter; its cells are twice the largest diameter wide. A hash of the cell decides whether
 it contains a pebble, and its position, diameter, outline, height and albedo. Pebbles are many where the ground is
-darker than its mean (lag in hollows), and rare where it is brighter (dust, crests). Like texture, pebbles belong to the
-ground: they change normals, albedo and shadows, but not the range. A pixel has one ray and sees means over its
-footprint: outlines are blurred, normals of small pebbles flattened, and pebbles fade where they become smaller than a
-pixel.
+darker than its mean (lag in hollows, coarse grains on crests), and rare where it is brighter (dust). They are many in
+rough surface units, and rare in smooth ones. Like texture, pebbles belong to the ground: they change normals, albedo
+and shadows, but not the range. A pixel has one ray and sees means over its footprint: outlines are blurred, normals of
+small pebbles flattened, and pebbles fade where they become smaller than a pixel.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from dataclasses import dataclass
 from itertools import product
 
 import drjit as dr
+import numpy as np
 
 from marsyard.sim.render.arrays import Values, clip, larger, smaller
 from marsyard.sim.render.device import Array3f, Float, Float64, Int32, UInt32
 from marsyard.sim.render.noise import hash_cell, mix_bits
 from marsyard.sim.terrain.sites import SitePebbles
-from marsyard.sim.terrain.surface import Surface
+from marsyard.sim.terrain.surface import ROUGHNESS, Surface
 
 #: Width of a cell divided by the largest diameter of its octave: a pebble and its shadow, together not longer than a
 #: cell, lie in the four cells nearest to the middle between them.
@@ -61,6 +62,7 @@ class PebbleField:
     - cell_coverage: fraction of a cell that its pebble covers in the mean
     - height_ratio, log_albedo, log_albedo_sd: of a pebble
     - ground_mean, ground_sd: mean and standard deviation of the logarithm of the ground's albedo
+    - roughness: mean roughness of the surface units
     """
 
     largest: Values
@@ -75,6 +77,7 @@ class PebbleField:
     log_albedo_sd: Values
     ground_mean: Values
     ground_sd: Values
+    roughness: Values
 
     @classmethod
     def of(cls, pebbles: SitePebbles, ground: Surface) -> PebbleField:
@@ -88,14 +91,19 @@ class PebbleField:
         # the coverage of successive octaves, largest pebbles first, increases by 2**excess
         probability = p.coverage / cell_coverage / sum(2.0 ** (excess * octave) for octave in range(octaves))
         numbers = (probability, 2.0**q - 1.0, 2.0**excess, -1.0 / q, cell_coverage)
-        properties = (p.height_ratio, p.log_albedo, p.log_albedo_sd, *ground.log_albedo_moments)
+        roughness = float(ground.factors[..., ROUGHNESS].mean(dtype=np.float64))
+        properties = (p.height_ratio, p.log_albedo, p.log_albedo_sd, *ground.log_albedo_moments, roughness)
         return cls(Float64(p.largest_m), UInt32(octaves), *map(Float, numbers), *map(Float, properties))
 
-    def density_at(self, albedo: Values) -> Values:
-        """Density of pebbles on ground of an albedo divided by the mean density: log-normal, with the mean 1."""
+    def density_at(self, albedo: Values, roughness: Values) -> Values:
+        """Density of pebbles divided by the mean density: log-normal on ground of an albedo, with the mean 1.
+
+        It is in proportion to the roughness of the surface unit, relative to the mean roughness of the terrain.
+        """
         deviation = (dr.log(larger(albedo, 1e-6)) - self.ground_mean) / larger(self.ground_sd, 1e-6)
         deviation = dr.select(self.ground_sd > 1e-6, deviation, -0.5 * PATCHINESS)
-        return smaller(dr.exp(-PATCHINESS * (deviation + 0.5 * PATCHINESS)), MAX_DENSITY)
+        density = dr.exp(-PATCHINESS * (deviation + 0.5 * PATCHINESS)) * roughness / self.roughness
+        return smaller(density, MAX_DENSITY)
 
 
 @dataclass(eq=False)

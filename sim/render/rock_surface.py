@@ -38,8 +38,11 @@ _FINE_FRACTURE = 0.3
 _FRACTURE_SEED, _FINE_FRACTURE_SEED, _MARGIN_SEED = 7, 8, 11
 #: Step of the finite differences of the grain, in cells; minimum size of a rock, metres.
 _STEP_CELLS, _MIN_SIZE_M = 0.1, 1e-3
-#: Texture of other objects, such as rovers, as a fraction of that of rocks: slight wear (assumed).
+#: Texture of users' meshes as a fraction of that of rocks: slight wear (assumed).
 WEAR = 0.15
+#: A rover has wrinkled fabric, dents, seams and dust: the grain of a rock of this size, metres, and this fraction of a
+#: rock's dust (assumed).
+WRINKLED_M, ROVER_DUST = 0.25, 0.4
 
 
 def describe_grain(

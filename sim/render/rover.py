@@ -5,22 +5,24 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.rover import RoverParameters, Stance, compute_bogie_pivots, compute_wheel_centres
+from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.objects import Objects
 
-#: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast: dusty, matt,
-#: assumed; rather dark, because parts do not hide the light of the sky from each other.
-ALBEDOS = {"deck": 0.14, "body": 0.15, "wheel": 0.2, "mast": 0.35}
+#: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast, without
+#: dust: matt, assumed; dark, because parts do not hide the light of the sky from each other.
+ALBEDOS = {"deck": 0.1, "body": 0.09, "wheel": 0.08, "mast": 0.25}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
-#: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions
-#: of those of the deck.
-_LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
+#: Width of the legs, thickness of the deck, m, assumed; length and width of the body as fractions of those of the deck.
+_LEG_M, _DECK_M, _BODY_FRACTION = 0.05, 0.04, (0.58, 0.4)
+#: Radius of the mast, m (from its shadow in a hazard image of Opportunity, 1F483288473, accurate to about 30 %).
+_MAST_RADIUS_M = 0.028
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
-_HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
+_HEAD_M, _BEHIND_M = (0.1, 0.08, 0.08), 0.04
 #: Sides of the bottom of the frustum that hides the sky, as a fraction of those of a rectangle around the wheels. Ray
 #: casting of all parts (`benchmarks.validation.sky_checks`) asks for less, the dark shadows of flown rovers for more.
 _SHELTER_BOTTOM = 0.95
@@ -40,6 +42,9 @@ _EQUIPMENT = (
     *(((0.72, 0.2, 0.0), (0.72, 0.2, 0.06), 0.03), ((0.74, -0.24, 0.0), (0.74, -0.24, 0.04), 0.045)),
     *(((0.5, 0.58, 0.0), (0.5, 0.58, 0.05), 0.03), ((0.36, -0.85, 0.0), (0.36, -0.85, 0.035), 0.05)),
 )
+#: Small parts along the edge of the deck (connectors, brackets, hinges, ties of cables): their number, minimum and
+#: maximum length and radius, m (assumed). They make the edge of the rover's shadow as irregular as on Mars.
+_EDGE_PARTS, _EDGE_LENGTH_M, _EDGE_RADIUS_M = 96, (0.01, 0.07), (0.005, 0.03)
 #: Number of cleats of a wheel, their height, and radii of rim and hub, as fractions of the wheel's radius; number of
 #: spokes. Read from images of MER's wheels, accurate to about 10 %.
 _CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
@@ -50,14 +55,19 @@ _STEERING_HEIGHT, _BRACKET_GAP_M, _BRACKET_RADIUS, _LEG_SAG_M = 1.6, 0.03, 0.7, 
 _SIDES, _SEGMENTS = 12, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
-_ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
-_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.022, 0.035, 0.12
+_ARM_JOINTS_M = ((0.05, 0.3, -0.33), (0.042, -0.32, -0.34), (0.06, 0.34, -0.36))
+_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.016, 0.03, 0.1
 #: Cables at the front, relative to the same point: start, end, and how far they hang forward and down, m; their radius.
 _CABLES_M = (
-    ((0.0, 0.4, -0.28), (0.0, -0.38, -0.26), (0.05, -0.08)),
-    ((0.0, 0.36, -0.31), (0.0, -0.42, -0.3), (0.03, -0.05)),
+    ((0.02, 0.4, -0.3), (0.02, -0.38, -0.28), (0.05, -0.06)),
+    ((0.03, 0.36, -0.31), (0.0, -0.42, -0.3), (0.03, -0.05)),
+    ((0.06, 0.42, -0.33), (0.05, 0.02, -0.33), (0.02, 0.02)),
+    ((0.08, 0.34, -0.36), (0.0, 0.1, -0.3), (0.05, 0.03)),
+    ((0.08, -0.4, -0.25), (0.05, 0.05, -0.33), (-0.02, -0.03)),
+    ((0.05, -0.3, -0.34), (0.02, -0.5, -0.1), (0.06, -0.05)),
+    ((0.05, 0.3, -0.3), (0.02, 0.5, -0.12), (0.08, -0.03)),
 )
-_CABLE_RADIUS_M = 0.009
+_CABLE_RADIUS_M = 0.006
 
 #: Position and normal of each corner of each triangle.
 Solid = Float64[np.ndarray, "triangles 3 2 3"]
@@ -72,12 +82,13 @@ def rover_objects(
     azimuth_rad: float,
     elevation_rad: float,
     baseline_m: float = 0.3,
+    steering_rad: float = 0.0,
 ) -> Objects:
     """Build the rover with the pose and joint angles of `stance` and the mast at these true angles.
 
     Its bodies are deck, body with arm and legs, each wheel, and mast. To add it to the rocks of a scene:
     ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the baseline of the widest stereo pair; the
-    head is slightly wider.
+    head is slightly wider. `steering_rad` is the angle by which the front wheels are turned to the left.
     """
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
@@ -87,8 +98,10 @@ def rover_objects(
     parts = {
         "deck": [_build_deck(rover)],
         "body": [_build_body(rover, stance)],
-        # only points are moved, not normals
-        "wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres],
+        "wheel": [
+            _transform(wheel, rigid(Rotation.from_euler("z", steering_rad if wheel_number % 3 == 0 else 0.0), centre))
+            for wheel_number, centre in enumerate(centres)
+        ],
         "mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)],
     }
     bodies = [
@@ -121,10 +134,36 @@ def _build_deck(rover: RoverParameters) -> Solid:
     size = np.array([0.5 * rover.body_length_m, 0.5 * rover.body_width_m, 1.0])
     above = np.array([0.0, 0.0, rover.deck_m])
     equipment = [(size * start + above, size * end + above, radius) for start, end, radius in _EQUIPMENT]
+    equipment += _draw_edge_parts(above, size)
     left, half = np.array(_OUTLINE), 0.5 * _DECK_M
     outline = np.concatenate([left, left[:0:-1] * (1.0, -1.0)]) * size[:2]
     profile = [(rover.deck_m + z, factor) for z, factor in ((-half, 0.0), (-half, 1.0), (half, 1.0), (half, 0.0))]
     return np.concatenate([_shade_flat(_stack_rings(profile, outline)), _make_cylinders(equipment)])
+
+
+def _draw_edge_parts(above: Point, size: Point) -> list[Cylinder]:
+    """Return small parts along the deck's outline, which point outwards and up.
+
+    Positions, lengths, radii and directions are a low-discrepancy sequence (Roberts 2018: powers of the real root of
+    x**5 = x + 1). `above` is the middle of the deck, `size` half its length and width, metres.
+    """
+    left = np.array(_OUTLINE)
+    outline = np.concatenate([left, left[:0:-1] * (1.0, -1.0), left[:1]]) * size[:2]
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
+    place, turn, length, radius = (
+        np.mod(np.arange(1, _EDGE_PARTS + 1) * 1.1673039783**-power, 1.0) for power in (1.0, 2.0, 3.0, 4.0)
+    )
+    points = np.column_stack([np.interp(place * distance[-1], distance, outline[:, k]) for k in (0, 1)])
+    outwards = points / np.linalg.norm(points, axis=1, keepdims=True)
+    elevation = 0.5 * np.pi * turn
+    directions = np.column_stack([np.cos(elevation)[:, None] * outwards, np.sin(elevation)])
+    lengths, radii = (
+        low + fraction * (high - low)
+        for fraction, (low, high) in ((length, _EDGE_LENGTH_M), (np.square(radius), _EDGE_RADIUS_M))
+    )
+    starts = np.column_stack([points, np.zeros(_EDGE_PARTS)]) + above
+    ends = starts + lengths[:, None] * directions
+    return list(zip(starts, ends, radii.tolist(), strict=True))
 
 
 def _build_body(rover: RoverParameters, stance: Stance) -> Solid:

@@ -21,7 +21,7 @@ from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.obstructions import MOUND_RANGE, Mounds, Obstructions, Shelter
 from marsyard.sim.render.pebbles import PebbleField
 from marsyard.sim.render.photometry import Photometry
-from marsyard.sim.render.rock_surface import describe_grain
+from marsyard.sim.render.rock_surface import ROVER_DUST, WRINKLED_M, describe_grain
 from marsyard.sim.render.shading import Light, Materials, ObjectSurfaces
 from marsyard.sim.render.shadows import Footprint, Occluders
 from marsyard.sim.render.sky import Sun
@@ -207,12 +207,14 @@ class Scene:
         """Relief, textures, normals and albedo."""
         objects, surfaces = self.objects, None
         if len(objects) > 0:
-            # dust covers a part of the level faces of rocks
-            covered = self.dust_cover * objects.is_rock
+            # dust covers a part of the level faces of rocks and rovers, less of rovers
+            covered = self.dust_cover * np.where(objects.is_rock, 1.0, ROVER_DUST * objects.is_rover)
             dust_albedo = (1.0 - covered) * objects.albedo + covered * self.dust_albedo
-            # only rocks with texture have grain
+            # only rocks and rovers with texture have grain
             sizes = 0.5 * (objects.bounds[:, 3:5] - objects.bounds[:, :2]).sum(axis=1)
-            sizes *= objects.is_rock & bool(self.object_texture.amplitudes)
+            sizes = np.where(objects.is_rock, sizes, WRINKLED_M * objects.is_rover) * bool(
+                self.object_texture.amplitudes
+            )
             surfaces = ObjectSurfaces(
                 vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
                 to_device(Int32, objects.body_of_triangle),

@@ -171,7 +171,7 @@ def shade(
     if materials.objects is not None:
         grainy_normal = normal - (rock.slope - dr.dot(rock.slope, normal) * normal)
         normal = dr.select(is_grainy, dr.normalize(grainy_normal), normal)
-    slopes = None
+    slopes, roughness = None, Float(1.0)
     if materials.relief is not None:
         # tilted normals change the mean radiance, but the reflectance law already includes the mean effect of all
         # roughness: the mean is restored below
@@ -187,7 +187,7 @@ def shade(
     pebbles = None
     if materials.pebbles is not None:
         footprint = dr.select(is_ground, points.footprint, dr.inf)
-        density = materials.pebbles.density_at(ground.albedo)
+        density = materials.pebbles.density_at(ground.albedo, roughness)
         pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun), density)
         bump_x, bump_y = pebbles.normal.x / pebbles.normal.z, pebbles.normal.y / pebbles.normal.z
         bumped = Array3f(normal.x / normal.z + bump_x, normal.y / normal.z + bump_y, 1.0)

@@ -31,6 +31,9 @@ class Dunes(Parameters):
         float, Field(ge=0.3, le=20.0, description="length over which the spacing persists, wavelengths")
     ] = 1.5
     albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
+    sharpness: Annotated[Fraction, Field(description="0: round crests of dunes, 1: peaked ones of coarse ripples")] = (
+        0.0
+    )
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the dunes."""
@@ -57,9 +60,10 @@ class Dunes(Parameters):
         modulation = np.ascontiguousarray(modulation[::step, ::step])
         max_slope = float(np.tan(np.radians(self.repose_deg)))
         slip_face_m = self.height_m / max_slope
-        layer = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
+        samples = SAMPLES_ON_SLIP_FACE * (1.0 + 3.0 * self.sharpness)
+        layer = ground.coarser(min(slip_face_m / samples, ground.period_m / modulation.shape[0]))
         kx, ky = (float(wavenumber) for wavenumber in wave_vector)
-        bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
+        bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast, self.sharpness)
         add_dunes(layer.height, layer.log_albedo, layer.spacing_m, modulation, bedforms)
         return layer
 

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int32, Int64
 from numpy.random import Generator
 from pydantic import Field, model_validator
 
-from marsyard.sim.parameters import NonNegative, Parameters, Positive
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
 from marsyard.sim.streams import substream
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
@@ -92,6 +92,7 @@ class RockParameters(Parameters):
     albedo_spread: Annotated[NonNegative, Field(description="standard deviation of the logarithm of rocks' albedo")] = (
         0.0
     )
+    fragments: Annotated[Fraction, Field(description="fraction of the rocks that lies next to a larger one")] = 0.0
     placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at given positions")] = ()
     tails: Annotated[WindTails | None, Field(description="wind tails of rocks")] = None
 
@@ -341,7 +342,9 @@ def _draw_positions(
         return placed_positions
     occupied = np.column_stack([placed_positions, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
-    random_positions = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
+    random_positions = place_discs(
+        radius[count:], occupied, density, period_m, cell, MAX_TRIES, parameters.fragments, rng
+    )
     n_unplaced = int(np.count_nonzero(np.isnan(random_positions[:, 0])))
     if n_unplaced:
         total = len(random_positions)

@@ -7,6 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+#: Power of a uniform number that selects the larger rock of a fragment from those sorted by size, minimum ratio of the
+#: radii, and mean distance of a fragment from the larger rock's outline, in radii of that rock (assumed).
+PARENT_POWER, MIN_PARENT, SPREAD = 2.5, 3.0, 0.6
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -89,13 +92,16 @@ def place_discs(
     period: float,
     cell_m: float,
     max_tries: int,
+    fragments: float,
     rng: np.random.Generator,
 ) -> Array:
     """Draw positions (x, y) of discs without overlap on a periodic square, with probability proportional to `density`.
 
     Discs are placed in order, the largest first, each at the first of its random positions that is free (rejection
     sampling). `occupied` has rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc
-    without a free position after `max_tries` gets NaN. `cell_m` is the approximate side of the cells of the search.
+    without a free position after `max_tries` gets NaN. `cell_m` is the approximate side of the cells of the search. The
+    fraction `fragments` of the discs lies next to a larger disc that was placed before, at a distance with an
+    exponential distribution.
     """
     rows, max_density = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
@@ -118,10 +124,26 @@ def place_discs(
         entries = _list_disc(grid, disc, entries)
     positions = np.full((radii.size, 2), np.nan)
     for n in range(radii.size):
+        first = occupied.shape[0]
+        is_fragment = (
+            fragments > 0.0
+            and rng.random() < fragments
+            and n > 0
+            # the discs are ordered by size: the first one is the largest
+            and grid.discs[first, 2] > MIN_PARENT * radii[n]
+        )
         for _ in range(max_tries):
             x, y = rng.random() * period, rng.random() * period
             i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
-            if rows > 1 and rng.random() * max_density > density[i, j]:
+            if is_fragment:
+                parent = first + int(rng.random() ** PARENT_POWER * n)
+                if grid.discs[parent, 2] <= MIN_PARENT * radii[n]:
+                    continue
+                angle = 2.0 * math.pi * rng.random()
+                away = radii[n] + grid.discs[parent, 2] * (1.0 - SPREAD * math.log(1.0 - rng.random()))
+                x = (grid.discs[parent, 0] + away * math.cos(angle)) % period
+                y = (grid.discs[parent, 1] + away * math.sin(angle)) % period
+            elif rows > 1 and rng.random() * max_density > density[i, j]:
                 continue
             if _is_free(grid, x, y, radii[n]):
                 positions[n, 0], positions[n, 1] = x, y

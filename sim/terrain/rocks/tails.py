@@ -15,7 +15,7 @@ from marsyard.sim.terrain.surface import Surface
 if TYPE_CHECKING:
     from marsyard.sim.terrain.rocks.field import RockField
 
-SAMPLES_ACROSS = 4.0  #: Minimum width of a tail in samples of the terrain; narrower tails are omitted.
+SAMPLES_ACROSS = 2.5  #: Minimum width of a tail in samples of the terrain; narrower tails are omitted.
 
 
 class WindTails(Parameters):

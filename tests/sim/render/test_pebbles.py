@@ -11,6 +11,7 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Float
+from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.pebbles import CELL_DIAMETERS, PebbleField, pebble_surface
 from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import TerrainBank, site
@@ -69,7 +70,7 @@ def test_pebbles_are_many_on_dark_ground_and_rare_on_bright_ground() -> None:
     samples = np.stack([np.zeros((64, 64)), 0.2 * np.exp(0.1 * rng.standard_normal((64, 64)))], axis=-1)
     field = PebbleField.of(SitePebbles(coverage=0.05), Surface.from_samples(samples.astype(np.float32), 1.0))
     deviations = rng.standard_normal(200_000)
-    density = to_host(field.density_at(Float(0.2 * np.exp(0.1 * deviations))))
+    density = to_host(field.density_at(Float(0.2 * np.exp(0.1 * deviations)), Float(1.0)))
     # about 1 % of the pebbles of a log-normal density are above its maximum
     assert density.mean() == pytest.approx(1.0, abs=0.05)
     assert density[deviations < -1.0].mean() > 8.0 * density[deviations > 1.0].mean()
@@ -79,17 +80,31 @@ def test_pebbles_are_many_on_dark_ground_and_rare_on_bright_ground() -> None:
     assert lag / bare == pytest.approx(6.0, rel=0.25)
 
 
+@pytest.mark.parametrize("has_ripples", [False, True])
 @pytest.mark.parametrize("name", ["gusev", "meridiani"])
-def test_hollows_hold_lag_and_crests_are_bare(name: str) -> None:
-    terrain, pebbles = site(name).terrain("ground", {"samples": 1024}), site(name).pebbles
+def test_hollows_hold_lag_and_ripples_have_granules_on_their_crests(name: str, has_ripples: bool) -> None:
+    changes = {} if has_ripples else {"ripples": None, "dunes": None}
+    terrain, pebbles = site(name).terrain("ground", {"samples": 1024, **changes}), site(name).pebbles
     assert pebbles is not None
     surface = TerrainBank(terrain, 5).terrain(0)
     height, albedo = np.moveaxis(surface.levels[0], -1, 0)
-    density = to_host(PebbleField.of(pebbles, surface).density_at(Float(albedo.ravel()))).reshape(albedo.shape)
+    density = to_host(PebbleField.of(pebbles, surface).density_at(Float(albedo.ravel()), Float(1.0)))
+    density = density.reshape(albedo.shape)
     # above the mean of the surroundings over half a metre
     relative = height - gaussian_filter(height, 0.5 / terrain.spacing_m, mode="wrap")
     low, high = np.quantile(relative, (0.1, 0.9))
-    assert density[relative < low].mean() > 1.5 * density[relative > high].mean()
+    in_hollows, on_crests = density[relative < low].mean(), density[relative > high].mean()
+    assert on_crests > 1.2 * in_hollows if has_ripples else in_hollows > 1.2 * on_crests
+
+
+def test_pebbles_are_many_in_rough_units() -> None:
+    factors = np.ones((2, 2, 3), dtype=np.float32)
+    factors[0, :, 0] = 0.2
+    samples = np.stack([np.zeros((16, 16)), np.full((16, 16), 0.2)], axis=-1).astype(np.float32)
+    field = PebbleField.of(SitePebbles(coverage=0.05), Surface.from_samples(samples, 1.0, factors))
+    smooth, rough = to_host(field.density_at(Float(0.2, 0.2), Float(0.2, 1.0)))
+    # the mean roughness is 0.6
+    assert (smooth, rough) == pytest.approx((1.0 / 3.0, 5.0 / 3.0), rel=1e-5)
 
 
 def test_pebbles_do_not_stand_in_rows_and_columns() -> None:
@@ -152,7 +167,7 @@ def test_one_ray_per_pixel_sees_the_mean_over_its_footprint(renderer: Renderer, 
     assert np.corrcoef(images[0].ravel(), mean.ravel())[0, 1] > 0.9
 
 
-def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
+def test_dust_lies_on_level_faces_of_rocks_and_less_on_rovers(renderer: Renderer) -> None:
     level = np.array([[8.0, 8.0, 0.4], [8.4, 8.0, 0.4], [8.4, 8.4, 0.4], [8.0, 8.4, 0.4]])
     steep = np.array([[7.0, 8.0, 0.3], [7.05, 8.0, 1.0], [7.05, 8.4, 1.0], [7.0, 8.4, 0.3]])
     normal = np.cross(steep[1] - steep[0], steep[2] - steep[0])
@@ -160,15 +175,16 @@ def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
     faces, body = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32), np.array([0, 0, 1, 1])
     sky_only = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=1.0, surrounding_albedo=0.0)
     night, brightness = Sun(direction(0.0, np.radians(-10.0))), {}
-    for name in (5, ROVER_NAME):
+    for name in (5, ROVER_NAME, FIRST_MESH_NUMBER):
         names = np.full(4, name, dtype=np.int32)
         objects = Objects.of_mesh(np.concatenate([level, steep]), normals, faces, names, 0.1, body.astype(np.int32))
         dust: dict[str, Any] = {"dust_albedo": 0.5, "dust_cover": 0.8}
         scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), night, sky_only, objects, **dust, **NEAR_MESH)
         frame = look_down(renderer, scene, (6.6, 8.2, 3.0), 1.2, 400)
         brightness[name] = [float(np.median(frame.radiance[frame.body == number])) for number in (0, 1)]
-    # 0.2 * 0.1 + 0.8 * 0.5 on the rock; a rover has no dust
+    # 0.2 * 0.1 + 0.8 * 0.5 on the rock; a rover has 40 % of this dust, a user's mesh none
     assert brightness[5][0] == pytest.approx(0.42, abs=1e-3)
-    assert brightness[ROVER_NAME][0] == pytest.approx(0.1, abs=1e-3)
+    assert brightness[ROVER_NAME][0] == pytest.approx(0.68 * 0.1 + 0.32 * 0.5, abs=1e-3)
+    assert brightness[FIRST_MESH_NUMBER][0] == pytest.approx(0.1, abs=1e-3)
     # the steep face, 86 deg from level, has (cos(86) - cos(115)) / (cos(30) - cos(115)) = 38.2 % of this dust
-    assert brightness[5][1] / brightness[ROVER_NAME][1] == pytest.approx(1.0 + 3.2 * 0.382, abs=0.05)
+    assert brightness[5][1] / brightness[FIRST_MESH_NUMBER][1] == pytest.approx(1.0 + 3.2 * 0.382, abs=0.05)

@@ -7,6 +7,7 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import Renderer, Scene, Sun, Texture
 from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Float
+from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.rock_surface import MAX_BED_RATIO, RockSurface, describe_grain, rock_surface, texture_frame
 from marsyard.sim.render.rover import ROVER_NAME
 from tests.sim.scenes import LAMBERT, NEAR_MESH, flat_ground, level_plate, look_down
@@ -64,10 +65,15 @@ def test_dust_has_a_patchy_margin_and_fractures_are_dark_and_rare() -> None:
 
 @pytest.mark.parametrize(
     ("name", "amplitudes", "contrast"),
-    [(5, (), (0.0, 1e-3)), (5, (0.12,) * 7, (0.1, 1.0)), (ROVER_NAME, (0.12,) * 7, (1e-6, 0.02))],
-    ids=["bare rock", "rock", "rover"],
+    [
+        (5, (), (0.0, 1e-3)),
+        (5, (0.12,) * 7, (0.1, 1.0)),
+        (ROVER_NAME, (0.12,) * 7, (0.1, 1.0)),
+        (FIRST_MESH_NUMBER, (0.12,) * 7, (1e-6, 0.02)),
+    ],
+    ids=["bare rock", "rock", "rover", "mesh of a user"],
 )
-def test_rocks_have_grain_and_rovers_slight_wear_where_there_is_texture(
+def test_rocks_and_rovers_have_grain_and_meshes_slight_wear_where_there_is_texture(
     renderer: Renderer, name: int, amplitudes: tuple[float, ...], contrast: tuple[float, float]
 ) -> None:
     """The normals in the truth are those of the geometry."""

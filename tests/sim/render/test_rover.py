@@ -1,5 +1,7 @@
 """Tests of the rendered rover: shape, pose and shadow."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -23,8 +25,8 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
     low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
     # The lowest point of a wheel is a cleat, or between two cleats 18 deg apart: at most 1.3 % of the radius higher.
     assert low[2] == pytest.approx(2.0, abs=0.013 * rover.wheel_radius_m)
-    # The head extends 0.06 m above its centre.
-    assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
+    # The head extends 0.04 m above its centre.
+    assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.04, abs=1e-9)
     assert (low[1], high[1]) == pytest.approx(
         (20.0 - 0.5 * rover.body_width_m, 20.0 + 0.5 * rover.body_width_m), abs=0.2
     )
@@ -78,6 +80,19 @@ def test_deck_has_gaps_between_its_panels_and_carries_antennas() -> None:
     assert behind[:, 2].max() == pytest.approx(MER.deck_m + 0.55, abs=1e-6)
 
 
+def test_only_front_wheels_turn() -> None:
+    stance, steering = settle(MER, Plane(), 0.0, 0.0, EAST), 0.2
+    straight, turned = (rover_objects(MER, stance, MER_MAST, 0.0, 0.0, steering_rad=angle) for angle in (0.0, steering))
+    bodies = list(pairwise(straight.first_triangle))
+    has_moved = [not np.allclose(straight.triangles[a:b], turned.triangles[a:b]) for a, b in bodies]
+    # deck, body, wheels in the order of `WHEELS`, mast
+    assert has_moved == [False, False, True, False, False, True, False, False, False]
+    wheel = turned.triangles[turned.first_triangle[2] : turned.first_triangle[3]].reshape(-1, 3)
+    # positive angles turn the wheel to the left, here from east to north: its rim is long along this direction
+    across = (wheel - wheel.mean(axis=0)) @ np.array([-np.sin(steering), np.cos(steering), 0.0])
+    assert np.ptp(across) == pytest.approx(MER.wheel_width_m, abs=0.01)
+
+
 def test_wheels_follow_the_suspension() -> None:
     # The left front wheel stands on a block: its lowest points are at the height of the block.
     stance = settle(MER, Mounds(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
@@ -128,10 +143,10 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     points = frame.points_world()
     is_shaded = frame.radiance < 0.1 * frame.radiance.max()
     assert 0.1 < np.mean(is_shaded) < 0.5
-    # The shadow is a band along the east-west direction, as wide as the mast (radius 0.05 m).
+    # The shadow is a band along the east-west direction, as wide as the mast (radius 0.028 m).
     band_points = points[is_shaded & (np.abs(points[..., 0] - expected[0]) < 0.1)]
     assert band_points[:, 1].mean() == pytest.approx(expected[1], abs=0.01)
-    assert np.ptp(band_points[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
+    assert np.ptp(band_points[:, 1]) == pytest.approx(2 * 0.028, abs=0.02)
 
 
 @pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])

@@ -201,13 +201,14 @@ def test_inconsistent_landforms_are_rejected(invalid: dict[str, object], message
         synthesise(make_parameters(**invalid), np.random.default_rng(0))
 
 
-def test_dune_kernel_matches_scipy() -> None:
+@pytest.mark.parametrize("sharpness", [0.0, 1.0])
+def test_dune_kernel_matches_scipy(sharpness: float) -> None:
     """Compare the spline and arctangent of `add_dunes` with SciPy and NumPy; the other formulas are the same."""
     side, spacing, crest, max_slope = 128, 3.0, 4.0, 0.6
     modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
     wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
     height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
-    add_dunes(height, log_albedo, spacing, modulation, Bedforms(wave[0], wave[1], crest, max_slope, 0.3))
+    add_dunes(height, log_albedo, spacing, modulation, Bedforms(wave[0], wave[1], crest, max_slope, 0.3, sharpness))
     rows, columns = np.mgrid[:side, :side]
     real, imaginary = (
         map_coordinates(
@@ -223,11 +224,12 @@ def test_dune_kernel_matches_scipy() -> None:
     stoss, slip_face = crest_phase / (1.0 - slip_fraction), (1.0 - crest_phase) / slip_fraction
     shape = np.where(
         crest_phase < 1.0 - slip_fraction,
-        0.25 * stoss + 0.75 * stoss**2 * (3.0 - 2.0 * stoss),
+        stoss**2 * (0.4 + 0.6 * stoss) if sharpness else 0.25 * stoss + 0.75 * stoss**2 * (3.0 - 2.0 * stoss),
         np.where(slip_face > 0.5, 4.0 / 3.0 * slip_face - 1.0 / 3.0, 4.0 / 3.0 * slip_face**2),
     )
     np.testing.assert_allclose(height, crest_height * shape, atol=1e-5)
-    np.testing.assert_allclose(log_albedo, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
+    grains = shape**3 if sharpness else shape
+    np.testing.assert_allclose(log_albedo, 0.3 * (grains - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
 
 
 def test_cracks_follow_periodic_voronoi_borders() -> None:

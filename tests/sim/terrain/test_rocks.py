@@ -136,6 +136,17 @@ def test_no_two_rocks_overlap(field: RockField) -> None:
     assert np.all(np.hypot(*offsets_m.T) >= radius_m[pairs].sum(axis=1))
 
 
+def test_fragments_lie_next_to_larger_rocks(ground: Surface) -> None:
+    near_larger = []
+    for fragments in (0.0, 0.5):
+        field = make_field(ground, abundance=0.05, smallest_m=0.05, fragments=fragments, placed=())
+        is_larger, is_small = field.diameter_m > 0.3, field.diameter_m < 0.1
+        larger = cKDTree(field.position_m[is_larger, :2], boxsize=np.full(2, field.period_m))
+        distance, nearest = larger.query(field.position_m[is_small, :2])
+        near_larger.append(np.mean(distance < field.diameter_m[is_larger][nearest]))
+    assert near_larger[1] > 2.0 * near_larger[0]
+
+
 def test_rocks_of_max_abundance_cover_the_specified_fraction(ground: Surface) -> None:
     field = make_field(ground, abundance=0.4, smallest_m=0.06, placed=())
     covered_fraction = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2

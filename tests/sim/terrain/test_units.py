@@ -216,9 +216,9 @@ def test_sides_are_not_steeper_than_the_cross_section_allows() -> None:
     assert np.tan(np.radians(20.0)) < steepest < 1.7 * np.tan(np.radians(20.0))
 
 
-def test_rocks_narrower_than_four_samples_have_no_tail() -> None:
-    assert not _make_surface_with_tail(WindTails(), diameter_m=3.9 * SPACING_M).levels[0][..., 0].any()
-    assert _make_surface_with_tail(WindTails(), diameter_m=4.1 * SPACING_M).levels[0][..., 0].any()
+def test_rocks_narrower_than_two_and_a_half_samples_have_no_tail() -> None:
+    assert not _make_surface_with_tail(WindTails(), diameter_m=2.4 * SPACING_M).levels[0][..., 0].any()
+    assert _make_surface_with_tail(WindTails(), diameter_m=2.6 * SPACING_M).levels[0][..., 0].any()
 
 
 def test_tails_in_the_bank_do_not_move_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,7 @@ class Bedforms(NamedTuple):
     - height_m: RMS height of the crests above the troughs, metres
     - slip_face_slope: slope of the slip face, metres per metre
     - contrast: natural logarithm of the albedo of crests divided by that of troughs
+    - sharpness: weight of a stoss slope that steepens up to the crest; the rest is round near the crest
     """
 
     wave_x: float
@@ -30,6 +31,7 @@ class Bedforms(NamedTuple):
     height_m: float
     slip_face_slope: float
     contrast: float
+    sharpness: float
 
 
 @njit(cache=True, inline="always")
@@ -62,6 +64,7 @@ def _add_row_of_dunes(
 ) -> None:
     """Add dunes along a row from the complex modulation at its samples and the plane wave's phase at the first one."""
     phase_step, rms_height, contrast = dunes.wave_x * spacing, dunes.height_m, dunes.contrast
+    sharpness = dunes.sharpness
     wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
     # the upper half of the slip face is plane, the lower half concave: it is 4/3 as long as a plane face;
     # the length of the slip face is expressed as a fraction of the wavelength
@@ -75,11 +78,14 @@ def _add_row_of_dunes(
         slip = min(max(slip_per_height * crest_height, MIN_SLIP), MAX_SLIP)
         v = u / (1.0 - slip)
         stoss = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
+        stoss += sharpness * (v * v * (0.4 + 0.6 * v) - stoss)
         w = (1.0 - u) / slip
         slip_face = 4.0 / 3.0 * w - 1.0 / 3.0 if w > 0.5 else 4.0 / 3.0 * w * w
         shape = stoss if u < 1.0 - slip else slip_face
         height[j] += crest_height * shape
-        log_albedo[j] += contrast * (shape - 0.5) * min(strength, 1.0)
+        # coarse grains lie on sharp crests only
+        grains = shape + sharpness * (shape * shape * shape - shape)
+        log_albedo[j] += contrast * (grains - 0.5) * min(strength, 1.0)
 
 
 @njit(cache=True)
