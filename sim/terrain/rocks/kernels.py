@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 #: Power of a uniform number that selects the larger rock of a fragment from those sorted by size, minimum ratio of the
 #: radii, and mean distance of a fragment from the larger rock's outline, in radii of that rock (assumed).
 PARENT_POWER, MIN_PARENT, SPREAD = 2.5, 3.0, 0.6
+FRAGMENT_TRIES = 200  #: Number of tries after which a fragment is placed like any other disc.
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -101,7 +102,7 @@ def place_discs(
     sampling). `occupied` has rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc
     without a free position after `max_tries` gets NaN. `cell_m` is the approximate side of the cells of the search. The
     fraction `fragments` of the discs lies next to a larger disc that was placed before, at a distance with an
-    exponential distribution.
+    exponential distribution, if it finds a position there in `FRAGMENT_TRIES` tries.
     """
     rows, max_density = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
@@ -132,10 +133,10 @@ def place_discs(
             # the discs are ordered by size: the first one is the largest
             and grid.discs[first, 2] > MIN_PARENT * radii[n]
         )
-        for _ in range(max_tries):
+        for attempt in range(max_tries):
             x, y = rng.random() * period, rng.random() * period
             i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
-            if is_fragment:
+            if is_fragment and attempt < FRAGMENT_TRIES:
                 parent = first + int(rng.random() ** PARENT_POWER * n)
                 if grid.discs[parent, 2] <= MIN_PARENT * radii[n]:
                     continue

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.field import decay_per_m, draw_diameters
+from marsyard.sim.terrain.rocks.kernels import place_discs
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
     COARSEST,
@@ -145,6 +146,14 @@ def test_fragments_lie_next_to_larger_rocks(ground: Surface) -> None:
         distance, nearest = larger.query(field.position_m[is_small, :2])
         near_larger.append(np.mean(distance < field.diameter_m[is_larger][nearest]))
     assert near_larger[1] > 2.0 * near_larger[0]
+
+
+def test_fragments_without_a_place_next_to_larger_rocks_lie_elsewhere() -> None:
+    radii = np.array([1.0] + [0.3] * 300)
+    positions = place_discs(
+        radii, np.empty((0, 3)), np.ones((1, 1), dtype=np.float32), 30.0, 1.0, 2000, 1.0, np.random.default_rng(1)
+    )
+    assert np.isfinite(positions).all()
 
 
 def test_rocks_of_max_abundance_cover_the_specified_fraction(ground: Surface) -> None:
