@@ -24,7 +24,7 @@ _MAST_RADIUS_M = 0.028
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.1, 0.08, 0.08), 0.04
 #: Sides of the bottom of the frustum that hides the sky, as a fraction of those of a rectangle around the wheels. Ray
-#: casting of all parts (`benchmarks.validation.sky_checks`) asks for less; shadows are as dark as those of flown rovers.
+#: casting of all parts (`benchmarks.validation.sky_checks`) asks for less; shadows are as dark as those of flown ones.
 _SHELTER_BOTTOM = 0.85
 #: Left half of the deck's outline from front to rear, x and y as fractions of half its length and width: the solar
 #: panels of MER, with gaps between them (read from drawings of the press kit, accurate to about 5 %).
