@@ -229,7 +229,7 @@ def _expose(
     radiance = hazy_radiance * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
     # the name of a random stream determines its values, so that it must not change
     auto_exposure = sensor.auto_expose(
-        detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
+        detector, radiance, sensor.AutoExposureParameters(), streams.generator("exposure images")
     )
     counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
     return auto_exposure, counts

@@ -96,8 +96,7 @@ def simulate_run(key: RunKey) -> FieldRun:
     pass_indices = np.repeat(np.arange(len(pass_times)), [times.size for times in pass_times])
     clock = Clock.draw(p.images.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
-    # "picture tags" is the name of a random stream: another name would change the random values
-    tags = clock.tags(times, generator("picture tags"))
+    tags = clock.tags(times, generator("image tags"))
     position = gps.measure(flight, tags, generator("gps noise"))
     solution = _estimate_attitudes(flown, ground, clock, gps)
     attitudes = solution.attitude(tags)

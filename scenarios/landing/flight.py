@@ -63,7 +63,7 @@ class LandingFlight:
         gravity = p.site_preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         # another name of a random stream would change the random values
-        received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
+        received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost images"))
         # laser ranges to the ground, without rocks, at all images
         motion = transit.flight.path.motion(transit.times_s)
         laser = RangingUnit.draw(p.laser, streams.generator("laser"))

@@ -175,7 +175,7 @@ class Transit:
         navigation_leg = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.imaging_duration_s, p.transit.images)
         # another name of a random stream would change the random values
-        clock_stream = streams.generator("picture clock")
+        clock_stream = streams.generator("image clock")
         tags = Clock.draw(p.image_clock, clock_stream).tags(times, clock_stream)
         return cls(p, instruments, air, flight, navigation_leg, times, tags)
 

@@ -73,7 +73,7 @@ def take_images(
     frames, motions = zip(*frames_and_motions, strict=True)
     radiances = [frame.radiance * np.float32(world.brightness) for frame in frames]
     # another name of a random stream would change the random values
-    detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
+    detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("exposure images")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
     delivered_images = corrupt_images(
         counts,
