@@ -13,6 +13,7 @@ from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.reports.validation_rows import Conditions
+from marsyard.sim.terrain.sites import sites
 
 #: Seed of the simulated descents.
 SEED = 4002
@@ -108,7 +109,7 @@ CHECKS = (
                 site=("gusev",),
                 camera=("mer-descent-flown",),
                 sun_elevation_deg=(30.0, 60.0),
-                slope_deg=(1.55, 1.55),
+                slope_deg=(sites()["gusev"].terrain("descent").rms_slope_deg,) * 2,
                 optical_depth=(0.9, 0.9),
                 range_m=(1400.0, 2100.0),
             ),

@@ -25,6 +25,7 @@ from marsyard.algorithms.dimes.products import TRACK_COLUMNS
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.sim.sensor import preset
+from marsyard.sim.terrain.sites import sites
 from marsyard.site_images import ImageRequest, render_images
 
 #: Altitudes of two of Spirit's descent images, metres.
@@ -203,7 +204,7 @@ _DESCENT = Conditions(
     site=("gusev",),
     camera=("mer-descent-flown",),
     sun_elevation_deg=(SUNS_DEG["gusev"][1],) * 2,
-    slope_deg=(1.55, 1.55),
+    slope_deg=(sites()["gusev"].terrain("descent").rms_slope_deg,) * 2,
     optical_depth=_OPTICAL_DEPTH,
     range_m=ALTITUDES_M,
 )
@@ -212,7 +213,7 @@ _MERIDIANI = replace(
     rows="*meridiani*",
     site=("meridiani",),
     sun_elevation_deg=(SUNS_DEG["meridiani"][1],) * 2,
-    slope_deg=(1.8, 1.8),
+    slope_deg=(sites()["meridiani"].terrain("descent").rms_slope_deg,) * 2,
 )
 CHECKS = (
     Check(
