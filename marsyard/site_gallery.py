@@ -20,10 +20,10 @@ from marsyard.site_images import ImageRequest, render_images
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 
-PAGE, SHEET = "index.html", "contact-sheet.png"
+PAGE, SHEET = "index.html", "contact-sheet.jpg"
 #: Maximum width of the images on the page.
 PAGE_WIDTH_PX = 760
-#: JPEG quality of the images on the page, and of the full-size files.
+#: JPEG quality of the images on the page and the contact sheet, and of the full-size files.
 PAGE_QUALITY, FULL_QUALITY = 82, 92
 #: Columns of the contact sheet, and width and height of its cells.
 COLUMNS, CELL_PX = 4, (240, 180)
@@ -31,9 +31,6 @@ COLUMNS, CELL_PX = 4, (240, 180)
 GAP_PX, LABEL_PX, LABEL_SCALE, LABEL_BASELINE_PX = 8, 22, 0.42, 8
 #: Grey levels of background and labels of the contact sheet.
 SHEET_BACKGROUND, SHEET_TEXT = 24, 235
-#: Maximum file size of the contact sheet, and the numbers of grey levels to try for it.
-SHEET_BYTES = 300_000
-SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
 #: Percentiles of the signal that are displayed black and white; the black one is multiplied by `BLACK_FRACTION`.
 BLACK_PERCENTILE, WHITE_PERCENTILE = 0.5, 99.7
 BLACK_FRACTION = 0.6
@@ -162,7 +159,7 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
 
 
 def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
-    """Draw all images, reduced, on one PNG (`compress_sheet`)."""
+    """Draw all images, reduced, on one JPEG image."""
     cell_width, cell_height = CELL_PX
     rows = -(-len(images) // COLUMNS)
     size = (rows * (cell_height + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (cell_width + GAP_PX) + GAP_PX)
@@ -179,19 +176,4 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - LABEL_BASELINE_PX)
         cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, LABEL_SCALE, SHEET_TEXT, 1, cv2.LINE_AA)
-    return compress_sheet(sheet)
-
-
-def compress_sheet(sheet: Grey) -> bytes:
-    """Compress a contact sheet to a PNG of at most `SHEET_BYTES`, with as many grey levels as possible.
-
-    If it is larger with each number of `SHEET_GREYS`, it has the last one: a sheet of many images has no size limit.
-    """
-    png = b""
-    for grey_levels in SHEET_GREYS:
-        step = 255.0 / (grey_levels - 1)
-        quantised = np.rint(np.rint(sheet / step) * step).astype(np.uint8)
-        png = encode_image(".png", quantised, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        if len(png) <= SHEET_BYTES:
-            break
-    return png
+    return encode_image(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])

@@ -151,8 +151,10 @@ def test_demo_has_enough_cases_to_decide_a_requirement() -> None:
     (cases,) = map(int, re.findall(r'-n "\$\{CASES:-(\d+)\}"', text))
     requirements = load_campaign("dimes-smoke").definition.requirements
     needed = {entry.id: minimum_sample_size(entry.probability, entry.confidence, 0) for entry in requirements}
-    # 45 cases without a failure show a rate of 95 % at 90 % confidence: 0.95^45 < 0.1
-    assert needed["DIMES-AVAIL"] == 45 <= cases < needed["DIMES-VEL"]
+    assert cases < needed["DIMES-VEL"]
+    # also with four failures, twice the rate of `dimes-gusev`: P(X <= 4) < 0.1 for 48 cases and a failure rate of 0.2
+    availability = next(entry for entry in requirements if entry.id == "DIMES-AVAIL")
+    assert minimum_sample_size(availability.probability, availability.confidence, 4) <= cases
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
