@@ -103,3 +103,9 @@ def read_evidence(directory: Path) -> Evidence:
 def read_statuses(directory: Path) -> list[str]:
     """Read the statuses of the requirements from a report."""
     return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
+
+
+def confirm(marsyard: Command, name: str, *arguments: object) -> tuple[int, list[str]]:
+    """Run a confirmation in the folder `name`; return its exit status and the statuses of its requirements."""
+    output = marsyard("run", "fake.toml", "--confirm", "--jobs", 1, "--out", name, *arguments)
+    return output.status, read_statuses(Path(name)) if Path(name, "report.json").exists() else []

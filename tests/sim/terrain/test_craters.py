@@ -23,6 +23,7 @@ from marsyard.sim.terrain.landforms.craters import (
     OUTLINE_EXPONENT,
     OUTLINE_RMS,
     SECONDARY_FRACTION,
+    WIND_ASYMMETRY,
     add_craters,
     crater_rows,
     draw_craters,
@@ -246,6 +247,17 @@ def test_sand_and_ejecta_fade_as_craters_wear() -> None:
     margin_m, worn = craters["margin"][middle] * craters["radius"][middle], 1.0 - freshness[middle]
     assert (margin_m >= 1.5 + 12.0 * 0.3 * worn - 1e-9).all()
     assert (margin_m <= 1.5 + 12.0 * worn + 1e-9).all()
+
+
+@pytest.mark.parametrize(("wind_from_deg", "direction"), [(0.0, (0.0, 1.0)), (90.0, (1.0, 0.0))])
+def test_sand_is_thicker_on_the_side_from_which_the_wind_blows(
+    wind_from_deg: float, direction: tuple[float, float]
+) -> None:
+    """x is east, y is north. Behind the upwind rim, the crater is sheltered."""
+    units = {"kinds": [{"name": "plain", "fraction": 1.0}], "wind_from_deg": wind_from_deg}
+    craters = draw_craters(WORN.with_changes({"units": units}), np.random.default_rng(1))
+    mean = craters["lee_x"].mean(), craters["lee_y"].mean()
+    assert mean == pytest.approx(WIND_ASYMMETRY * np.array(direction), abs=0.02)
 
 
 def test_small_craters_gather_in_clusters() -> None:
