@@ -1,4 +1,5 @@
-# Marsyard's tasks; `make` lists them. Each one first runs the set-up, which returns immediately if it is complete.
+# Marsyard's tasks; `make` lists them. Each one first runs the set-up, which returns immediately if it is complete; that of
+# the demo leaves out the tools for tests and documentation.
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint format bench bench-check docs validate constraints clean distclean
@@ -13,7 +14,8 @@ help: ## List the tasks
 setup: ## Install system libraries and the environment in .venv
 	@tools/setup.sh
 
-demo: setup ## Run a small rendered descent campaign and write its report
+demo: ## Run a small rendered descent campaign and write its report
+	@tools/setup.sh --demo
 	@tools/demo.sh
 
 test: setup ## Run all checks and tests

@@ -2,6 +2,8 @@
 
 import contextlib
 import ctypes
+import functools
+import importlib.metadata
 import os
 import sys
 from collections.abc import Sequence
@@ -34,6 +36,8 @@ os.environ["PYOPENGL_PLATFORM"] = _BACKEND
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_variable] = "1"
 os.environ["MPLBACKEND"] = "Agg"
+# The installed distributions are constant during the tests; listing them takes half a second, twice per campaign.
+importlib.metadata.packages_distributions = functools.cache(importlib.metadata.packages_distributions)
 # Programs started by tests, and their workers, import test modules by name.
 os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(ROOT)])
 # Terrains of tests have a separate persistent cache; compiled kernels are shared with the user's cache.

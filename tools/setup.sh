@@ -3,13 +3,16 @@
 # If nothing has changed, it returns immediately.
 #
 #   PYTHON=/path/to/python   the interpreter to build .venv with; otherwise the first Python >= 3.11 on the PATH
-#   tools/setup.sh --slow-tests installs only the programs for the slow tests (`make validate`)
+#   tools/setup.sh --demo        installs what campaigns need, without the tools for tests and documentation
+#   tools/setup.sh --slow-tests  installs only the programs for the slow tests (`make validate`)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=.venv
 stamp=$venv/.setup-done             # what the environment was made from, written last
 unfinished=$venv/.setup-unfinished # exists while pip runs; if it is left over, the environment is created again
+extras=dask,dev,docs,geo,spice
+[ "${1:-}" != --demo ] || extras=dask,geo,spice
 
 # Debian packages of each GL backend. Those that are not of Mesa are for pyrender, which imports its viewer.
 osmesa=(libosmesa6 libgl1 libxrender1)
@@ -41,7 +44,7 @@ contents() { cat pyproject.toml constraints.txt tools/setup.sh | sha256sum | cut
 
 up_to_date() {
     [ -f "$stamp" ] && [ ! -e "$unfinished" ] && [ -x "$venv/bin/python" ] && is_python "$venv/bin/python" &&
-        [ "$(cat "$stamp")" = "$(foundation) $(contents)" ]
+        case "$(cat "$stamp")" in "$(foundation) $(contents) $extras" | "$(foundation) $(contents) "*dev*) ;; *) return 1 ;; esac
 }
 
 usable_venv() {
@@ -125,7 +128,7 @@ install_packages() {
     : >"$unfinished"
     # setuptools first, with its pinned version: an isolated build would download another version
     "${install[@]}" pip setuptools
-    "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo,spice]'
+    "${install[@]}" --no-build-isolation -e ".[$extras]"
     # on all cores; pip would use one
     "$venv/bin/python" -m compileall -q -j 0 "$venv/lib" >/dev/null || true
 }
@@ -164,9 +167,9 @@ else
     install_gl_libraries "$python"
     make_venv "$python"
 fi
-install_compiler
+case $extras in *dev*) install_compiler ;; esac
 install_packages
 check_rendering
 rm -f "$unfinished"
-printf '%s %s' "$(foundation)" "$(contents)" >"$stamp"
+printf '%s %s %s' "$(foundation)" "$(contents)" "$extras" >"$stamp"
 say "done"

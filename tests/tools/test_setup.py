@@ -51,7 +51,7 @@ esac
     return root
 
 
-def run_setup(checkout: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def run_setup(checkout: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     home = checkout.parent
     variables = {
         "PATH": f"{home / 'bin'}:/usr/bin:/bin",
@@ -60,7 +60,7 @@ def run_setup(checkout: Path, **environment: str) -> subprocess.CompletedProcess
         "APT_LOG": str(home / "apt.log"),
     }
     return subprocess.run(
-        ["bash", str(checkout / "tools" / "setup.sh")],
+        ["bash", str(checkout / "tools" / "setup.sh"), *arguments],
         env=variables | environment,
         capture_output=True,
         text=True,
@@ -78,6 +78,21 @@ def test_second_setup_changes_nothing(checkout: Path) -> None:
     second = run_setup(checkout)
     assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
     assert count_lines(checkout.parent / "pip.log") == pip_calls > 0
+
+
+def test_setup_adds_the_tools_after_a_demo(checkout: Path) -> None:
+    log = checkout.parent / "pip.log"
+    run_setup(checkout, "--demo")
+    assert ".[dask,geo,spice]" in log.read_text()
+    calls = count_lines(log)
+    run_setup(checkout, "--demo")
+    assert count_lines(log) == calls
+    assert run_setup(checkout).returncode == 0
+    assert ".[dask,dev,docs,geo,spice]" in log.read_text()
+    calls = count_lines(log)
+    # the complete environment is also the demo's
+    assert run_setup(checkout, "--demo").stdout == ""
+    assert count_lines(log) == calls
 
 
 @pytest.mark.parametrize("file_name", ["pyproject.toml", "constraints.txt", "tools/setup.sh"])
