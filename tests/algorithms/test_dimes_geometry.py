@@ -190,8 +190,9 @@ def test_searchable_positions_show_the_complete_template() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     geometry = overlap.search_geometry(first, second, OPTIONS)
     centre, _ = ground_view.ground_from_pixels(second, np.array([[250.0, 128.0]]), MAX_OFF_NADIR_RAD)
-    searchable = overlap.searchable_positions(second, centre[0], geometry, OPTIONS)
-    offsets = geometry.gsd_m * (np.arange(2 * geometry.search_px + 1) - geometry.search_px)
+    searchable = overlap.searchable_positions(second, centre[0], geometry, OPTIONS)[::4, ::4]
+    # every fourth position
+    offsets = geometry.gsd_m * (np.arange(2 * geometry.search_px + 1)[::4] - geometry.search_px)
     half = 0.5 * (OPTIONS.template_px - 1) * geometry.gsd_m
     expected = [
         [

@@ -60,17 +60,6 @@ def test_points_are_distributed_by_bilinear_weights() -> None:
     np.testing.assert_allclose(ground.elevation_m, expected)
 
 
-def test_plane_is_reconstructed_from_even_points() -> None:
-    x, y = np.meshgrid(np.arange(40) * 0.25, np.arange(30) * 0.25)
-    points = np.column_stack([x.ravel(), y.ravel(), 0.2 * x.ravel() - 0.1 * y.ravel() - 9.0])
-    ground = elevation_map(points)
-    positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
-    plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
-    # Points are up to half a cell from the cell centre: the error is at most the rise within half a cell.
-    assert np.nanmax(np.abs(ground.elevation_m - plane)) < 0.5 * 0.3 * ground.cell_m
-    assert not np.any(np.isnan(ground.elevation_m))
-
-
 def test_cells_without_points_are_unknown() -> None:
     points = draw_points(4000, np.random.default_rng(3))
     points = points[np.hypot(points[:, 0] - 1.0, points[:, 1]) > 1.0]

@@ -184,15 +184,6 @@ def test_hazard_takes_precedence_over_unknown() -> None:
     assert np.all(safety[10:70, 11:90] == Safety.SAFE)
 
 
-def test_slope_and_roughness_hazards_are_combined() -> None:
-    zero = np.zeros((80, 100))
-    rough, steep = zero.copy(), zero.copy()
-    rough[40, 30], steep[40, 70] = 1.0, 1.0
-    safety = safe_landing_map(steep, rough, CELL_M, OPTIONS)
-    assert safety[40, 30] == safety[40, 70] == Safety.HAZARD
-    assert safety[40, 50] == Safety.SAFE
-
-
 def test_grassfire_transform_equals_distance_to_nearest_seed() -> None:
     rng = np.random.default_rng(4)
     is_seed = rng.random((40, 50)) < 0.01
@@ -228,15 +219,6 @@ def test_map_without_safe_cells_has_no_site() -> None:
     rough = make_ground()
     noise = np.random.default_rng(5).normal(0.0, 1.0, rough.elevation_m.shape)
     assert safe_site(hazard_maps(replace(rough, elevation_m=noise), OPTIONS).safety, np.zeros(2)) is None
-
-
-def test_map_holes_are_not_interpolated() -> None:
-    flat = make_ground(100, 100)
-    elevation = flat.elevation_m.copy()
-    elevation[30:70, 30:70] = np.nan
-    maps = hazard_maps(replace(flat, elevation_m=elevation), OPTIONS)
-    assert np.all(maps.safety[30:70, 30:70] == Safety.UNKNOWN)
-    assert np.any(maps.safety == Safety.SAFE)
 
 
 def test_small_holes_are_interpolated_and_wide_holes_are_not() -> None:
