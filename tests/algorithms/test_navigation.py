@@ -1,12 +1,9 @@
 """Tests of the rover's navigation: path planner, terrain map, and stereo and visual odometry on a textured plane."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.navigation import visual_odometry
@@ -14,6 +11,7 @@ from marsyard.algorithms.navigation.planner import NavigationOptions, Navigation
 from marsyard.algorithms.navigation.stereo import RectifiedPair
 from marsyard.algorithms.navigation.terrain_map import CELL_M, GroundLimits, TerrainMap
 from marsyard.algorithms.navigation.visual_odometry import VisualOdometryOutcome, estimate_motion
+from marsyard.scenarios.conformance.inputs import MEAN_RADIANCE, TexturedPlane
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, StereoMeasurement
@@ -237,8 +235,6 @@ def test_ground_around_the_target_has_no_hazards() -> None:
     assert terrain.goodness(LIMITS).at(np.array([[1.0, 0.0]]))[0] > 0.9
 
 
-#: Spacing of the texture's samples on the ground, metres.
-PLANE_SPACING_M = 0.01
 HEIGHT_M, BASELINE_M = 1.5, 0.2  #: Height of the cameras above the ground, and distance between them.
 
 
@@ -252,28 +248,13 @@ def _make_camera(left_m: float, toe_in_deg: float = 0.0) -> Cahv:
 CAMERAS = _make_camera(0.5 * BASELINE_M, -0.5), _make_camera(-0.5 * BASELINE_M, 0.5)
 
 
-@cache
-def _make_texture(contrast: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    noise = np.random.default_rng(5).standard_normal((1600, 1600))
-    smooth = gaussian_filter(noise, 1.5) + 4.0 * gaussian_filter(noise, 6.0)
-    smooth /= smooth.std()
-
-    def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        rows, columns = y / PLANE_SPACING_M + 800.0, x / PLANE_SPACING_M + 400.0
-        return 1500.0 * (1.0 + contrast * map_coordinates(smooth, [rows, columns], order=1, mode="wrap"))
-
-    return brightness
-
-
-def _render_pair(world_from_rover: RigidTransform, contrast: float = 0.2) -> StereoMeasurement:
+def _render_pair(world_from_rover: RigidTransform, contrast: float = 1.0) -> StereoMeasurement:
     """Render a stereo pair of the plane z = 0; shot noise: the variance in counts is 0.09 (0.3**2) times the counts."""
-    brightness, noise = _make_texture(contrast), np.random.default_rng(1)
+    plane, noise = TexturedPlane(np.zeros(3), np.eye(3)[:2], step_m=0.01), np.random.default_rng(1)
 
     def render(camera: CameraModel) -> np.ndarray:
-        origins, directions = camera.transform(world_from_rover).rays(camera.pixel_grid())
-        distance = -origins[..., 2] / np.minimum(directions[..., 2], -1e-6)
-        points = origins + distance[..., None] * directions
-        mean = brightness(points[..., 0], points[..., 1])
+        relative = plane.radiance(camera.transform(world_from_rover)).astype(np.float64) / MEAN_RADIANCE
+        mean = 1500.0 * (1.0 + contrast * (relative - 1.0))
         return np.rint(mean + 0.3 * np.sqrt(mean) * noise.standard_normal(mean.shape)).astype(np.uint16)
 
     return StereoMeasurement(render(CAMERAS[0]), render(CAMERAS[1]), CAMERAS)

@@ -14,7 +14,6 @@ from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
     epipolar_segments,
-    forward_backward_error,
     grid_spacing_px,
     match_pixels,
     pixel_lattice,
@@ -202,19 +201,6 @@ def test_matches_failing_the_forward_backward_check_are_counted(scene: Pass, lan
     statuses = np.where(has_failed, MatchStatus.ACCEPTED, with_check.statuses)
     np.testing.assert_array_equal(statuses, without_check.statuses)
     assert len(with_check.points) == with_check.accepted.sum()
-
-
-def test_correct_matches_pass_the_forward_backward_check(scene: Pass, landing_scene: LandingScene) -> None:
-    pixels = pixel_lattice((320, 240), 16, 6)
-    positions = undistort(landing_scene.views[0].camera, pixels)
-    _, _, is_inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
-    pixels, positions = pixels[is_inside].astype(np.int64), positions[is_inside]
-    true_pixels = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
-    forward_backward_px = forward_backward_error(
-        landing_scene.views, scene.second_from_first, pixels, true_pixels, positions, (7.0, 13.0), 5
-    )
-    # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.
-    assert np.mean(forward_backward_px <= 1.5) > 0.98
 
 
 def test_segments_are_clipped_at_the_image_border() -> None:

@@ -122,31 +122,31 @@ def render_features(scene: Pass) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     return first, second, features, scene.camera(1).project(scene.ground(0, features))[0]
 
 
-@pytest.mark.parametrize(("window_half", "fraction"), [(102, 0.8), (320, 0.7)])
-def test_displacement_by_the_baseline_of_the_campaigns_is_tracked(window_half: int, fraction: float) -> None:
-    """A baseline of 0.2 of the range moves the image by 81 of 320 px; the search starts at the first position."""
-    scene = make_pass((0.0, -2.0, 10.0, 20.0))
+@pytest.mark.parametrize(
+    ("second_pose", "window_half", "min_inside", "fraction"),
+    [
+        # A baseline of 0.2 of the range, that of the campaigns, moves the image by 81 of 320 px.
+        ((0.0, -2.0, 10.0, 20.0), 102, 20, 0.8),
+        ((0.0, -2.0, 10.0, 20.0), 320, 20, 0.7),
+        # A pitch of 15 deg moves the image by 100 to 120 of its 240 rows; the search window is the whole image. From a
+        # level at which the template covers most of the image, 0 and 0.6 of the features are tracked.
+        ((0.0, -0.6, 10.0, 20.0, 15.0), 320, 30, 0.8),
+        ((0.0, -0.6, 10.0, 20.0, -15.0), 320, 30, 0.8),
+    ],
+)
+def test_large_displacements_are_tracked(
+    second_pose: tuple[float, ...], window_half: int, min_inside: int, fraction: float
+) -> None:
+    """The search starts at the first position."""
+    scene = make_pass(second_pose)
     first, second, features, true_pixels = render_features(scene)
     is_inside = np.all((true_pixels > 12) & (true_pixels < np.array([307, 227])), axis=1)
     tracks = track_features(first, second, features, features, window_half, replace(OPTIONS, align=False))
     is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
-    assert is_inside.sum() >= 20
+    assert is_inside.sum() >= min_inside
     assert np.mean(is_correct[is_inside]) >= fraction
     narrow = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
     assert np.sum(narrow.accepted & (np.hypot(*(narrow.second - true_pixels).T) < 1.0)) < 0.2 * is_inside.sum()
-
-
-@pytest.mark.parametrize("pitch_deg", [15.0, -15.0])
-def test_displacement_along_the_shorter_side_is_tracked(pitch_deg: float) -> None:
-    """A pitch of 15 deg moves the image by 100 to 120 of its 240 rows; the search window is the whole image."""
-    scene = make_pass((0.0, -0.6, 10.0, 20.0, pitch_deg))
-    first, second, features, true_pixels = render_features(scene)
-    is_inside = np.all((true_pixels > 12) & (true_pixels < np.array([307, 227])), axis=1)
-    tracks = track_features(first, second, features, features, 320, replace(OPTIONS, align=False))
-    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
-    assert is_inside.sum() >= 30
-    # from a level at which the template covers most of the image, 0 and 0.6 of the features are tracked
-    assert np.mean(is_correct[is_inside]) >= 0.8
 
 
 def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
