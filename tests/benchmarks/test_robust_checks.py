@@ -10,10 +10,10 @@ from marsyard.reports.dispersion_changes import ChangeKind
 
 @pytest.mark.parametrize("state", _STATES, ids=lambda state: state.name)
 def test_rates_are_those_of_drawn_cases(state: robust_checks._State) -> None:
-    """The rate without a change and the permitted rate after the exact change: 400,000 cases, five deviations."""
+    """The rate without a change and the permitted rate after the exact change: 100,000 cases, five deviations."""
     rng = np.random.default_rng(5)
     for change, rate in ((0.0, state.rate(0.0)), (state.exact, state.permitted)):
-        z = rng.standard_normal((400_000, 2))
+        z = rng.standard_normal((100_000, 2))
         if state.kind is ChangeKind.MEAN_UP:
             z[:, 0] += change
         else:

@@ -65,7 +65,7 @@ def test_rates_of_climb_are_uniform() -> None:
 
 def test_run_ends_at_the_maximum_height() -> None:
     """Paper, III.C and III.D.4: from 1000 m to 2000 m, images for about 30 min, about 40 min between the targets."""
-    for seed in range(20):
+    for seed in range(6):
         passes = draw_default_flight(seed).passes
         assert passes[0].start_m == 1000.0
         for before, after in pairwise(passes):

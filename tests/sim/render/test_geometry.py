@@ -12,11 +12,10 @@ from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene,
 from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
-from marsyard.sim.render.ground import Extent, first_crossing, skip_empty_blocks
+from marsyard.sim.render.ground import Extent, first_crossing
 from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from tests.sim.scenes import descent_camera
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
@@ -118,27 +117,6 @@ def test_rays_enter_at_the_height_of_the_highest_ground_and_leave_at_the_extent(
     exits += [((0.0, 0.0, 0.0), (-2.0, 0.0, 0.5), 5.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), np.inf)]
     for origin, towards, expected in exits:
         assert to_host(extent.exit_distance(ray(origin, towards)))[0] == pytest.approx(expected)
-
-
-def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
-    """Rays skip to the first block whose ceiling is above the ray, in all directions and across the period."""
-    ceiling = terrain.ceilings[0]
-    device_terrain = Terrain.of_surface(terrain, ceilings=True)
-    block = CEILING_BLOCK * terrain.spacing_m
-    rng = np.random.default_rng(5)
-    for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
-        origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), float(ceiling.max()) + 5.0])
-        ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
-        start = rng.uniform(0.0, 50.0)
-        device_ray = Ray(Array3f64(*origin.tolist()), Array3f64(*ray.tolist()))
-        limits = Float64(start), Float64(5000.0)
-        skip_end_m = to_host(skip_empty_blocks(device_terrain, Int32(0), device_ray, *limits, Bool(True)))[0]
-        distances_m = np.arange(start, skip_end_m + 3.0 * block, 0.01 * block)
-        positions = origin + distances_m[:, None] * ray
-        block_row, block_column = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
-        is_below_ceiling = positions[:, 2] <= ceiling[block_row, block_column]
-        assert not is_below_ceiling[distances_m < skip_end_m - 1e-6].any()
-        assert is_below_ceiling[(distances_m > skip_end_m) & (distances_m < skip_end_m + 2.0 * block)].any()
 
 
 def test_mesh_resolution_does_not_change_the_image(renderer: Renderer, terrain: Surface) -> None:

@@ -193,8 +193,7 @@ def test_footprint_does_not_change_images() -> None:
     assert not to_host(scene.footprint.cells).all()
 
 
-@pytest.mark.parametrize("elevation", [0.25, 1.0])
-def test_culling_does_not_change_images(elevation: float) -> None:
+def test_culling_does_not_change_images() -> None:
     """A mast subframe among rocks is equal with and without culling, for two sun elevations and azimuths.
 
     A ray that meets the common edge of two triangles can hit either: the surface of its rock differs by rounding there.
@@ -205,9 +204,9 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     ground = SiteGround.from_site(
         site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})})
     )
-    rays = PixelRays.from_camera(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
+    rays = PixelRays.from_camera(preset("research-navcam").cameras()[0].crop(420, 400, (121, 121)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
-    for azimuth in (0.5, 3.0):
+    for azimuth, elevation in ((0.5, 1.0), (3.0, 0.25)):
         viewpoint = Viewpoint(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, max_distance_m=25.0)
         scene = site_scene(ground, viewpoint, Sun(direction(azimuth, elevation)))
         visible_scene = scene.restrict_to_cones([rays.cone(pose)])

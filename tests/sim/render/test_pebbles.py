@@ -53,15 +53,15 @@ def test_pebbles_cover_the_specified_fraction_of_the_ground() -> None:
 def test_sizes_follow_the_power_law_across_the_octaves() -> None:
     pebbles = SitePebbles(coverage=0.03, largest_m=0.064, smallest_m=0.008, log_albedo=-0.5, log_albedo_sd=0.0)
     spacing_m = 0.002
-    _, log_albedo, _ = _sample(pebbles, 1e-4, side=3000, spacing_m=spacing_m)
+    _, log_albedo, _ = _sample(pebbles, 1e-4, side=2400, spacing_m=spacing_m)
     regions, count = label(log_albedo < -0.25)
     # the mean outline has the area of 0.75 circles of its diameter, for axes with ratios of 0.5 to 1
     area = np.bincount(regions.ravel())[1:] * spacing_m**2
     diameter = np.sqrt(area / (0.25 * np.pi * 0.75))
     larger = [np.sum(diameter > size) for size in (0.012, 0.017, 0.024, 0.034)]
-    # three ranges, two of which contain the border of two octaves; about 100 pebbles are larger than 34 mm
+    # three ranges, two of which contain the border of two octaves; about 65 pebbles are larger than 34 mm
     ratios = np.divide(larger[:-1], larger[1:])
-    assert count > 2000
+    assert count > 1500
     assert ratios == pytest.approx(np.sqrt(2.0) ** 2.5, rel=0.25)
 
 
@@ -134,7 +134,7 @@ def test_pebbles_fade_where_they_are_smaller_than_a_pixel() -> None:
     assert strengths[3] == 0.0
 
 
-@pytest.mark.parametrize("elevation_deg", [25.0, 35.0, 60.0])
+@pytest.mark.parametrize("elevation_deg", [25.0, 60.0])
 def test_pebbles_move_with_the_ground_and_keep_its_mean_brightness(renderer: Renderer, elevation_deg: float) -> None:
     sun = Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
     plain, pebbly = (
@@ -159,8 +159,8 @@ def test_one_ray_per_pixel_sees_the_mean_over_its_footprint(renderer: Renderer, 
     pebbles = SitePebbles(coverage=0.25, log_albedo_sd=0.25)
     scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=pebbles, **NEAR_MESH)
     factor = 6
-    images = [look_down(renderer, scene, (8.0, 8.0, 1.5), 0.4, side).radiance for side in (280, 280 * factor)]
-    mean = images[1].reshape(280, factor, 280, factor).mean(axis=(1, 3))
+    images = [look_down(renderer, scene, (8.0, 8.0, 1.5), 0.2, side).radiance for side in (140, 140 * factor)]
+    mean = images[1].reshape(140, factor, 140, factor).mean(axis=(1, 3))
     # the ratio is 1.2 for ramps that do not preserve the outline's area and normals of the pixel's centre
     assert images[0].std() / mean.std() == pytest.approx(1.0, abs=0.1)
     assert images[0].mean() / mean.mean() == pytest.approx(1.0, abs=0.02)

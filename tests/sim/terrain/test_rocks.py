@@ -316,7 +316,7 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
 def _edge_radii(number: int) -> Float64[np.ndarray, "n"]:
     """Radii of curvature along a circle around a shape's vertical at 45 deg, in radii of the rock."""
     shape = _all_shapes()[number]
-    azimuth = np.radians(np.arange(0.0, 360.0, 0.05))
+    azimuth = np.radians(np.arange(0.0, 360.0, 0.1))
     directions = np.sqrt(0.5) * np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(azimuth.size)], axis=1)
     points = shape.to_unit_shape(directions * shape.radius(directions)[:, None])
     normals = shape.normals(directions)
