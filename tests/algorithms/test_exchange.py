@@ -30,21 +30,16 @@ from marsyard.algorithms.exchange.serving import Command, acquire_server, end_id
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.processes import processor_time_s
+from marsyard.scenarios.conformance import inputs
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
-from tests.algorithms.synthetic_descent import Flight, render, tilt_body
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-TRUE_VELOCITY = np.array([12.0, -7.0])
+TRUE_VELOCITY = inputs.DESCENT_VELOCITY_M_S[:2]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def measurements() -> DescentMeasurements:
-    """Render a nearly level descent with noise; the inertial velocity has an error of (3, -2) m/s."""
-    attitudes = (tilt_body(3.0, 20.0, 40.0), tilt_body(4.0, 60.0, 40.0), tilt_body(5.0, 90.0, 40.0))
-    steps = np.outer([0.0, 3.75, 7.5], [*TRUE_VELOCITY, -75.0])
-    flight = Flight(np.array([1000.0, 1000.0, 2000.0]) + steps, attitudes)
-    exact = render(flight, noise=np.random.default_rng(1))
-    return dataclasses.replace(exact, interval_velocities_m_s=flight.velocities + np.array([3.0, -2.0, 0.0]))
+    return inputs.descent()
 
 
 def write_program(folder: Path, body: str) -> str:
@@ -111,9 +106,9 @@ def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path
     # Each number in the files is a measurement, or an index or size; the true velocity is absent.
     case = json.loads((tmp_path / "case.json").read_text())
     numbers = np.array(list(_iterate_numbers(case)))
-    inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
+    measured = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
     indices = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
-    assert set(numbers) <= set(inputs) | indices
+    assert set(numbers) <= set(measured) | indices
     assert not np.isclose(numbers[:, None], TRUE_VELOCITY, atol=1e-3).any()
 
 

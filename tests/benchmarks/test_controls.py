@@ -25,6 +25,14 @@ SMALL: Mapping[str, ControlRun] = {
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", list(SMALL))
+def test_each_control_fails_a_requirement(name: str) -> None:
+    measure = measure_campaign(name, SMALL[name])
+    assert measure.passed, measure.how
+    assert len(measure.how.split(" | ")) == len(TITLES)
+
+
+@pytest.mark.slow
 def test_control_that_meets_all_requirements_is_reported(tmp_path: Path) -> None:
     """On gentle ground any site is safe: with HDA-FIND alone, estimators that use no image meet every requirement."""
     text, _, _ = find_campaign("hda-benign").read_text().partition("[[requirements]]")

@@ -164,33 +164,6 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
     np.testing.assert_allclose(matching.fit_biquadratic_peak(z)[:2], biquadratic_offset(surface, peak), atol=1e-12)
 
 
-def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
-    row, column = np.mgrid[-1.0:2.0, -1.0:2.0]
-    z = 0.9 - 0.3 * (row - 0.2) ** 2 - 0.2 * (column + 0.35) ** 2 - 0.1 * (row - 0.2) * (column + 0.35)
-    np.testing.assert_allclose(matching.fit_biquadratic_peak(z), (0.2, -0.35, 0.9), atol=1e-12)
-
-
-@pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-38, 33), (40, 40)])
-def test_integer_shifts_within_the_window_are_recovered(shift: tuple[int, int]) -> None:
-    # Coarse levels need image content at all scales.
-    rng = np.random.default_rng(4)
-    spectrum = np.fft.rfft2(rng.standard_normal((240, 320)))
-    frequency = np.hypot(np.fft.fftfreq(240)[:, None], np.fft.rfftfreq(320)[None])
-    frequency[0, 0] = np.inf
-    values = np.fft.irfft2(spectrum / frequency, (240, 320))
-    first = np.rint(500.0 + 100.0 * values / values.std()).clip(0, 4095).astype(np.uint16)
-    second = np.roll(first, shift[::-1], axis=(0, 1))
-    features = select_features(first, OPTIONS)
-    # Only features that are not affected by the periodic border.
-    features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
-    tracks = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
-    assert len(features) > 10
-    # The biquadratic fit is biased on texture as fine as pixels.
-    is_correct = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
-    assert is_correct.mean() > 0.9
-    assert np.all(tracks.correlations[is_correct] > 0.98)
-
-
 def make_pass(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
     """Create a pass at 10 m over a slope with a bump; `second` contains the arguments of `make_pose`."""
     return Pass(

@@ -16,13 +16,29 @@ from marsyard.sim.render.ground import Extent, first_crossing
 from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface
-from tests.sim.scenes import descent_camera
+from tests.sim.scenes import descent_camera, flat_ground
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Lambert reflectance: under the overhead sun, the radiance factor of level ground equals its albedo.
 ALBEDO_ONLY = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
 #: Tilted by 25 deg and rolled.
 ATTITUDE = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height_m", [500.0, 2000.0])
+def test_world_points_are_on_the_plane_and_on_rays(renderer: Renderer, height_m: float) -> None:
+    camera, pose = descent_camera(r=(0.01, -0.25, 0.08)), rigid(ATTITUDE, np.array([100.0, 50.0, height_m]))
+    scene = Scene(flat_ground(512, 1.5), (100.0, 50.0), OVERHEAD, ALBEDO_ONLY)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
+    points = frame.points_world()
+    assert np.isfinite(points).all()
+    assert np.abs(points[..., 2] / frame.range_m).max() < 1e-5
+    np.testing.assert_allclose(frame.points_world(np.s_[::100, ::100]), points[::100, ::100], rtol=0.0, atol=1e-9)
+    pixels, visible = camera.transform(pose).project(points)
+    assert visible.all()
+    # Rays have single precision: 6e-8 rad is 1e-4 px.
+    assert np.abs(pixels - camera.pixel_grid()).max() < 1e-3
 
 
 def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m: float) -> float:
