@@ -154,17 +154,6 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
 
 
-def test_driving_backwards_shrinks_the_template() -> None:
-    target = np.array([4.0, 0.1, 0.2])
-    drive = start_drive(target, 2)
-    for x in (-0.4, -0.8, -1.2):
-        update = drive.stop(pose(x, 0.0))
-        change = get_details(update).change
-        assert update.tracked
-        assert 0.88 < change.magnification < 0.93
-        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
-
-
 # ----- designation, stereo, poses -----
 
 

@@ -53,17 +53,6 @@ def test_command_equals_many_small_motions() -> None:
     assert command.displacement_m == pytest.approx(position, abs=1e-8)
 
 
-def test_target_stays_ahead_when_the_rover_circles_it() -> None:
-    distance_m, turn_rad = 7.0, np.radians(10.0)
-    command = DriveCommand(left_m=-distance_m * turn_rad, turn_left_rad=turn_rad)
-    start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    end = drive(MER, Plane(), NO_SLIP_SOIL, start, command, _rng()).end
-    target = end.world_from_rover.inv().apply(np.array([distance_m, 0.0, 0.0]))
-    assert target == pytest.approx([distance_m, 0.0, 0.0], abs=1e-7)
-    # A left turn around the target moves the rover right of its initial heading.
-    assert end.world_from_rover.translation[1] < 0.0
-
-
 def test_slip_of_one_half_halves_the_distance() -> None:
     # The default slip is one half on a slope of 15 deg: s = 0.01 + 0.99 * 0.75**2.4.
     slip = 0.01 + 0.99 * 0.75**2.4

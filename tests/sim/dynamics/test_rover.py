@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from marsyard.sim.dynamics.driven_ground import DrivenGround, RockyGround
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, compute_wheel_centres, settle
-from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
@@ -112,20 +112,6 @@ def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
     mound = settle(MER, Mounds(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-6
     assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
-
-
-def test_rock_of_a_field_lifts_the_wheel() -> None:
-    surface = Surface.from_samples(np.zeros((128, 128, 2), dtype=np.float32), 0.1)
-    rock = PlacedRock(name="step", east_m=6.4 + 0.705, north_m=6.4 + 0.53, diameter_m=0.3, height_m=0.1)
-    field = RockField.draw(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
-    mesh = field.rock(0, detail=0)
-    ground = RockyGround.from_triangles(surface, mesh.vertices[mesh.faces], (6.4, 6.4), 1.5)
-    heights = ground.height(*np.meshgrid(np.linspace(6.9, 7.3, 201), np.linspace(6.7, 7.1, 201)))
-    assert heights.max() == pytest.approx(mesh.vertices[:, 2].max(), abs=0.003)
-    stance = settle(MER, ground, 6.4, 6.4, EAST)
-    assert np.abs(stance.gaps_m).max() < 1e-4
-    assert stance.pitch_rad > 0.0
-    assert stance.differential_rad < 0.0
 
 
 def test_stance_does_not_depend_on_initial_guess() -> None:
