@@ -106,8 +106,10 @@ def test_blended_numbers_change_continuously() -> None:
     newest = Streams(5, "campaign", 8, ((8, 1.0),)).generator("detector").standard_normal((400, 400), dtype=np.float32)
     np.testing.assert_array_equal(_blended(0.3, "detector").standard_normal((400, 400), dtype=np.float32), newest)
     # one component has the numbers of its case
-    numbers = [Streams(5, "campaign", 8, *blend).generator("imu").standard_normal(10) for blend in ((), (((8, 1.0),),))]
-    np.testing.assert_array_equal(*numbers)
+    alone, blended = (
+        Streams(5, "campaign", 8, *blend).generator("imu").standard_normal(10) for blend in ((), (((8, 1.0),),))
+    )
+    np.testing.assert_array_equal(blended, alone)
 
 
 def test_components_do_not_depend_on_the_other_draws_of_a_case() -> None:

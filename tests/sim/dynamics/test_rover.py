@@ -104,16 +104,6 @@ def test_rocks_raise_the_ground() -> None:
     assert without_bodies.height(x, y) == pytest.approx(slope.height(x, y))
 
 
-def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
-    # The tops of block and mound are wider than the wheel's contact.
-    height_m = 0.10
-    ground = RockyGround.from_triangles(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
-    stance = settle(MER, ground, 0.0, 0.0, EAST)
-    mound = settle(MER, Mounds(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
-    assert np.abs(stance.gaps_m).max() < 1e-6
-    assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
-
-
 def test_stance_does_not_depend_on_initial_guess() -> None:
     ground = Mounds(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
     default_stance = settle(MER, ground, 0.0, 0.0, EAST)
