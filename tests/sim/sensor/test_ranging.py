@@ -52,15 +52,6 @@ def _make_radar(rng: np.random.Generator, **errors: object) -> RadarAltimeter:
     return RadarAltimeter.draw(RadarParameters.model_validate(errors), FLAT, rng)
 
 
-def test_error_free_readings_equal_the_truth() -> None:
-    radar = _make_radar(np.random.default_rng(0), **NO_ERRORS)
-    times = radar.sampling.within(0.0, 10.0)
-    readings = radar.measure(DESCENT, times, np.random.default_rng(1))
-    # Flat ground at height 0.
-    np.testing.assert_allclose(readings.values, DESCENT.motion(times).positions_m[:, 2], atol=1e-6)
-    np.testing.assert_array_equal(readings.times_s, times)
-
-
 def test_readings_are_measured_at_the_true_time() -> None:
     clock = ClockParameters(offset_s=0.02, jitter_sd_s=0.001)
     radar = _make_radar(np.random.default_rng(0), **NO_ERRORS | {"clock": clock})
