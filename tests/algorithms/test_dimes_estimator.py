@@ -59,7 +59,7 @@ def compute_rms(errors: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("seed", "count", "is_noisy", "max_rms_m_s"),
-    [(2024, 12, False, 0.05), pytest.param(2025, 6, True, 0.06, marks=pytest.mark.slow)],
+    [(2024, 6, False, 0.05), pytest.param(2025, 6, True, 0.06, marks=pytest.mark.slow)],
 )
 def test_velocity_error_is_within_the_requirement(seed: int, count: int, is_noisy: bool, max_rms_m_s: float) -> None:
     # The requirement is 0.15 m/s rms over flat terrain. Aliasing in the binned pixels causes 0.02 m/s (0.015 px).
@@ -106,22 +106,29 @@ def test_subpixel_refinement_reduces_velocity_error() -> None:
     assert fitted < 0.18
 
 
-def test_altitude_is_propagated_to_image_time() -> None:
-    flight = steady_flight((15.0, 5.0))
-    inputs = render(flight)
+@pytest.fixture(scope="module")
+def measurements() -> DescentMeasurements:
+    return render(steady_flight((10.0, 5.0)))
+
+
+@pytest.fixture(scope="module")
+def details(measurements: DescentMeasurements) -> DimesDetails:
+    return get_details(ESTIMATOR.estimate(measurements))
+
+
+def test_altitude_is_propagated_to_image_time(measurements: DescentMeasurements) -> None:
     # The altitudes are measured 0.5 s after the images; the lander descends at 75 m/s.
-    later = tuple(replace(a, altitude_m=a.altitude_m - 75.0 * 0.5, time_s=a.time_s + 0.5) for a in inputs.altitudes)
-    answer = ESTIMATOR.estimate(replace(inputs, altitudes=later))
-    np.testing.assert_allclose(valid_velocity(answer), [15.0, 5.0], atol=0.1)
+    later = (replace(a, altitude_m=a.altitude_m - 75.0 * 0.5, time_s=a.time_s + 0.5) for a in measurements.altitudes)
+    answer = ESTIMATOR.estimate(replace(measurements, altitudes=tuple(later)))
+    np.testing.assert_allclose(valid_velocity(answer), [10.0, 5.0], atol=0.1)
 
 
-def test_velocity_uses_image_time_tags() -> None:
-    inputs = render(steady_flight((12.0, 0.0)))
+def test_velocity_uses_image_time_tags(measurements: DescentMeasurements) -> None:
     # The first image is at 100 s; all intervals are 1.25 times as long.
-    images = tuple(replace(image, time_s=100.0 + 1.25 * (image.time_s - 100.0)) for image in inputs.images)
-    altitudes = tuple(replace(a, time_s=image.time_s) for a, image in zip(inputs.altitudes, images, strict=True))
-    answer = ESTIMATOR.estimate(replace(inputs, images=images, altitudes=altitudes))
-    np.testing.assert_allclose(valid_velocity(answer), [12.0 / 1.25, 0.0], atol=0.1)
+    images = tuple(replace(image, time_s=100.0 + 1.25 * (image.time_s - 100.0)) for image in measurements.images)
+    altitudes = tuple(replace(a, time_s=image.time_s) for a, image in zip(measurements.altitudes, images, strict=True))
+    answer = ESTIMATOR.estimate(replace(measurements, images=images, altitudes=altitudes))
+    np.testing.assert_allclose(valid_velocity(answer), [10.0 / 1.25, 5.0 / 1.25], atol=0.1)
 
 
 def test_velocity_is_correct_from_images_without_summed_rows() -> None:
@@ -175,10 +182,9 @@ def test_repetitive_terrain_is_rejected_by_second_peak(wavelength_m: float) -> N
     assert all(ValidityCheck.SECOND_PEAK in track.failed for track in get_details(answer).tracks)
 
 
-def test_disagreement_with_imu_rejects_the_velocity() -> None:
-    inputs = render(steady_flight((10.0, 5.0)))
-    velocities = inputs.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
-    answer = ESTIMATOR.estimate(replace(inputs, interval_velocities_m_s=velocities))
+def test_disagreement_with_imu_rejects_the_velocity(measurements: DescentMeasurements) -> None:
+    velocities = measurements.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+    answer = ESTIMATOR.estimate(replace(measurements, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
     assert get_details(answer).selected is None
     assert get_details(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.4)
@@ -196,11 +202,6 @@ def _change_counts(inputs: DescentMeasurements, change: ChangeCounts) -> Descent
 
 def _draw_random_counts(number: int, counts: np.ndarray) -> np.ndarray:
     return np.random.default_rng(number).integers(0, 4096, counts.shape, dtype=np.uint16)
-
-
-@pytest.fixture(scope="module")
-def measurements() -> DescentMeasurements:
-    return render(steady_flight((10.0, 5.0)))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +223,7 @@ def test_unusable_images_give_no_velocity(measurements: DescentMeasurements, cha
     dimes_products(get_details(answer))
 
 
-@pytest.mark.parametrize("altitude_m", [1e-300, 1e-3, 3.0, 120.0, 2e4, 9e5, 1e300, -10.0, np.nan, np.inf])
+@pytest.mark.parametrize("altitude_m", [1e-300, 3.0, 120.0, 2e4, 1e300, -10.0, np.nan])
 def test_wrong_altitude_gives_no_velocity(measurements: DescentMeasurements, altitude_m: float) -> None:
     altitudes = tuple(replace(a, altitude_m=altitude_m) for a in measurements.altitudes)
     answer = ESTIMATOR.estimate(replace(measurements, altitudes=altitudes))
@@ -230,8 +231,8 @@ def test_wrong_altitude_gives_no_velocity(measurements: DescentMeasurements, alt
 
 
 def test_wrong_attitude_gives_no_velocity(measurements: DescentMeasurements) -> None:
-    random = Rotation.random(3 * 15, rng=np.random.default_rng(5))
-    for k in range(15):
+    random = Rotation.random(3 * 6, rng=np.random.default_rng(5))
+    for k in range(6):
         attitudes = tuple(replace(a, world_from_body=random[3 * k + i]) for i, a in enumerate(measurements.attitudes))
         assert ESTIMATOR.estimate(replace(measurements, attitudes=attitudes)).outcome is not VelocityOutcome.VALID
     looking_up = tuple(replace(a, world_from_body=tilt_body(180.0, 0.0, 0.0)) for a in measurements.attitudes)
@@ -261,11 +262,11 @@ def test_any_sun_gives_a_velocity_or_no_template_area(measurements: DescentMeasu
 def test_zero_phase_spot_of_an_image_follows_from_its_sun(measurements: DescentMeasurements) -> None:
     suns = np.stack([direction(np.radians(azimuth), np.radians(80.0)) for azimuth in (90.0, 120.0, 150.0)])
     moving = get_details(ESTIMATOR.estimate(replace(measurements, sun_directions=suns)))
-    for pair, details in enumerate(moving.pairs):
+    fixed = [get_details(ESTIMATOR.estimate(replace(measurements, sun_direction=sun))) for sun in suns]
+    for pair in (0, 1):
         for image in (0, 1):
-            fixed = get_details(ESTIMATOR.estimate(replace(measurements, sun_direction=suns[pair + image])))
-            expected = fixed.pairs[pair].zero_phase_pixels[image]
-            np.testing.assert_array_equal(details.zero_phase_pixels[image], expected)
+            expected = fixed[pair + image].pairs[pair].zero_phase_pixels[image]
+            np.testing.assert_array_equal(moving.pairs[pair].zero_phase_pixels[image], expected)
 
 
 def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
@@ -314,8 +315,7 @@ def test_opposition_surge_does_not_bias_velocity() -> None:
     assert min(np.hypot(*(t.velocity_m_s - apparent_velocity)) for t in unmasked.tracks) < 5.0
 
 
-def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurements) -> None:
-    details = get_details(ESTIMATOR.estimate(measurements))
+def test_products_contain_the_keys_used_by_reports(details: DimesDetails) -> None:
     products = dimes_products(details)
     assert products["tracks_columns"] == [
         "pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width",
@@ -336,8 +336,7 @@ def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurem
     assert all(isinstance(value, np.ndarray | list) for value in products.values())
 
 
-def test_products_report_failures_and_selection(measurements: DescentMeasurements) -> None:
-    details = get_details(ESTIMATOR.estimate(measurements))
+def test_products_report_failures_and_selection(measurements: DescentMeasurements, details: DimesDetails) -> None:
     products = dimes_products(details)
     np.testing.assert_array_equal(products["selected"], [details.selected.first, details.selected.second])
     uniform = _change_counts(measurements, lambda number, counts: np.full_like(counts, 1000))
@@ -347,8 +346,7 @@ def test_products_report_failures_and_selection(measurements: DescentMeasurement
     np.testing.assert_array_equal(products["tracks"][:, column], 1.0)
 
 
-def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurements) -> None:
-    details = get_details(ESTIMATOR.estimate(measurements))
+def test_rectified_lattice_matches_track_pixels(details: DimesDetails) -> None:
     products = dimes_products(details)
     for track in details.tracks:
         west, north, step = products[f"rectified_frame_{track.pair}"]
@@ -369,14 +367,14 @@ def test_altitude_error_causes_predicted_velocity_error() -> None:
     flight = steady_flight((8.0, 3.0), attitudes)
     inputs = render(flight)
     error = 10.0
-    altitudes = (*inputs.altitudes[:2], replace(inputs.altitudes[2], altitude_m=inputs.altitudes[2].altitude_m + error))
-    tracks = [t for t in get_details(ESTIMATOR.estimate(replace(inputs, altitudes=altitudes))).tracks if t.pair == 1]
+    wrong = replace(inputs.altitudes[2], altitude_m=inputs.altitudes[2].altitude_m + error)
+    answer = ESTIMATOR.estimate(replace(inputs, altitudes=(*inputs.altitudes[:2], wrong)))
+    tracks = [track for track in get_details(answer).tracks if track.pair == 1]
     assert len(tracks) == 2
+    later = flight.positions[2, 2]
     for track in tracks:
-        earlier, later = (flight.positions[k, 2] for k in (1, 2))
         _, rays = inputs.images[2].camera.bin(4, 1).rays(track.match_pixel[None, :])
         ray = flight.attitudes[2].apply(rays[0])
         position = ray[:2] / -ray[2] * later
         expected = -error / later * position / INTERVAL_S
         np.testing.assert_allclose(track.velocity_m_s - flight.velocities[1, :2], expected, atol=0.18)
-        assert earlier > later

@@ -18,7 +18,7 @@ from tests.algorithms.synthetic_descent import (
     CAMERA,
     INTERVAL_S,
     ROWS_SUMMED,
-    Texture,
+    draw_terrain,
     expose_scene,
     make_calibration,
     tilt_body,
@@ -55,16 +55,6 @@ def find_candidates(first: BinnedView, second: BinnedView, sun: np.ndarray = SUN
     """Find the template candidates of a pair."""
     first, second = (replace(view, sun_direction=sun) for view in (first, second))
     return overlap.template_candidates(first, second, overlap.search_geometry(first, second, OPTIONS), OPTIONS)
-
-
-def test_ground_and_pixel_projections_are_inverse() -> None:
-    view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
-    pixels = overlap.grid_pixels(view.size, 16)
-    ground, is_within_limit = ground_view.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
-    projections, visible = ground_view.pixels_from_ground(view, ground)
-    assert is_within_limit.sum() > 200
-    assert np.all(visible[is_within_limit])
-    np.testing.assert_allclose(projections[is_within_limit], pixels[is_within_limit], atol=1e-6)
 
 
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
@@ -190,8 +180,9 @@ def test_searchable_positions_show_the_complete_template() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     geometry = overlap.search_geometry(first, second, OPTIONS)
     centre, _ = ground_view.ground_from_pixels(second, np.array([[250.0, 128.0]]), MAX_OFF_NADIR_RAD)
-    searchable = overlap.searchable_positions(second, centre[0], geometry, OPTIONS)
-    offsets = geometry.gsd_m * (np.arange(2 * geometry.search_px + 1) - geometry.search_px)
+    searchable = overlap.searchable_positions(second, centre[0], geometry, OPTIONS)[::4, ::4]
+    # every fourth position
+    offsets = geometry.gsd_m * (np.arange(2 * geometry.search_px + 1)[::4] - geometry.search_px)
     half = 0.5 * (OPTIONS.template_px - 1) * geometry.gsd_m
     expected = [
         [
@@ -274,20 +265,9 @@ def test_first_selected_template_is_in_the_textured_area() -> None:
     assert overlap.template_contrasts(view, pixels, OPTIONS.template_px)[selected_numbers[0]] == contrasts[0]
 
 
-def make_wave_texture() -> Texture:
-    """Create a texture with the analytic brightness `wave_brightness`: waves of 60 to 200 m."""
-    offsets_m = 1.5 * np.arange(2048)
-    return Texture(wave_brightness(offsets_m[None, :], -offsets_m[:, None]).astype(np.float32), 1.5)
-
-
-def wave_brightness(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
-    east, north = (2.0 * np.pi * x / (2048 * 1.5) for x in (east_m, north_m))
-    return 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
-
-
 def test_patch_across_the_border_repeats_the_border_pixels() -> None:
     attitude, position = tilt_body(0.0, 0.0, 0.0), np.array([0.0, 0.0, 1700.0])
-    counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
+    counts = expose_scene(trace_scene(draw_terrain(), attitude, position), make_calibration(), level=1600.0)
     view = make_view(attitude, 1700.0, 0.0, counts)
     columns, rows = view.size
     corner, _ = ground_view.ground_from_pixels(view, np.array([[columns - 1.0, rows - 1.0]]), MAX_OFF_NADIR_RAD)
@@ -297,42 +277,6 @@ def test_patch_across_the_border_repeats_the_border_pixels() -> None:
     assert np.count_nonzero(is_outside) > 50
     image = rectification.correct_patch(view, np.s_[:], np.s_[:])
     np.testing.assert_allclose(patch[is_outside], image[-1, -1], rtol=1e-12)
-
-
-def test_ground_lattice_is_north_up() -> None:
-    lattice = rectification.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
-    np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])
-    np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])
-
-
-@pytest.mark.parametrize(
-    "attitude", [tilt_body(0.0, 0.0, 0.0), tilt_body(18.0, 200.0, 140.0), tilt_body(25.0, 80.0, 300.0)]
-)
-def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None:
-    position = np.array([700.0, -300.0, 1700.0])
-    counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
-    view = make_view(attitude, 1700.0, 0.0, counts)
-    centre, is_within_limit = ground_view.ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
-    assert is_within_limit[0]
-    patch = rectification.rectify_patch(view, centre[0], 61, 5.5)
-    lattice = rectification.ground_lattice(centre[0], 61, 5.5) + position[:2]
-    expected = wave_brightness(lattice[..., 0], lattice[..., 1])
-    shift = _estimate_shift(patch / 1600.0, expected, lattice)
-    # 0.01 of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
-    assert np.abs(shift).max() < 0.06
-    np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)
-
-
-def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Estimate the displacement (east, north) of a patch from the expected one, metres, by one least-squares step."""
-    east, north = lattice[..., 0], lattice[..., 1]
-    slopes = [
-        (wave_brightness(east + dx, north + dy) - wave_brightness(east - dx, north - dy)) / 0.2
-        for dx, dy in ((0.1, 0.0), (0.0, 0.1))
-    ]
-    design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
-    solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
-    return np.asarray(solution[:2])
 
 
 def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
@@ -360,3 +304,9 @@ def test_homography_of_an_invisible_corner_is_invisible() -> None:
     lattice = rectification.ground_lattice(np.array([0.0, -40000.0]), 5, 5.5)
     _, is_visible = rectification.homography_lattice(view, lattice)
     assert not is_visible.any()
+
+
+def test_ground_lattice_is_north_up() -> None:
+    lattice = rectification.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
+    np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])
+    np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])

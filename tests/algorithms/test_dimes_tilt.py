@@ -88,7 +88,7 @@ def get_details(answer: VelocityEstimate) -> DimesDetails:
 @pytest.fixture(scope="module")
 def flights() -> list[tuple[Flight, DescentMeasurements]]:
     rng = np.random.default_rng(31)
-    drawn = [draw_flight(rng, max_tilt_deg=15.0, max_wind=20.0) for _ in range(4)]
+    drawn = [draw_flight(rng, max_tilt_deg=15.0, max_wind=20.0) for _ in range(2)]
     return [(flight, render(flight, noise=rng)) for flight in drawn]
 
 

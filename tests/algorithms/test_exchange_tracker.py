@@ -210,29 +210,11 @@ def test_all_three_target_designations_round_trip(target: TargetDesignation) -> 
     assert type(read_target(encode(target))) is type(target)
 
 
-class _Unchecked:
-    """Fields of a data class whose types are not checked at creation, as without the run-time checks of the tests."""
-
-    def __init__(self, **fields: object) -> None:
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
-
-
-class _UncheckedUpdate(_Unchecked, TargetUpdate):
-    pass
-
-
-class _UncheckedBox(_Unchecked, PixelBox):
-    pass
-
-
-class _UncheckedAim(_Unchecked, MastAim):
-    pass
-
-
 @pytest.mark.parametrize("losses", [TargetLoss.OUT_OF_VIEW, ("OUT_OF_VIEW",), None])
 def test_losses_of_another_type_are_refused(losses: object) -> None:
-    update = _UncheckedUpdate(state=TrackingState.LOST, losses=losses, position_rover=None, details=None)
+    update = TargetUpdate(TrackingState.LOST, (), None)
+    # the run-time checks of the tests would reject the type at creation
+    object.__setattr__(update, "losses", losses)
     with pytest.raises(AlgorithmError, match=r"losses is .*; allowed: a tuple of members of TargetLoss") as error:
         check_update(update)
     assert error.value.fault is Fault.BAD_ANSWER
@@ -240,8 +222,9 @@ def test_losses_of_another_type_are_refused(losses: object) -> None:
 
 @pytest.mark.parametrize("corner", [(0, 0, 0), (0,), None, (0.0, 0.0)])
 def test_region_with_another_number_of_coordinates_is_refused(corner: object) -> None:
-    box, right = _UncheckedBox(corner=corner, size=(64, 64)), PixelBox((0, 0), (64, 64))
-    aim = _UncheckedAim(azimuth_rad=0.0, elevation_rad=0.0, left=box, right=right)
+    left, right = PixelBox((0, 0), (64, 64)), PixelBox((0, 0), (64, 64))
+    object.__setattr__(left, "corner", corner)
+    aim = MastAim(azimuth_rad=0.0, elevation_rad=0.0, left=left, right=right)
     with pytest.raises(AlgorithmError, match=r"left has corner .*; allowed: whole pixels inside the frame") as error:
         check_aim(aim, trackers.mast())
     assert error.value.fault is Fault.BAD_ANSWER

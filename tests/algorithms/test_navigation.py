@@ -1,11 +1,9 @@
 """Tests of the rover's navigation: path planner, terrain map, and stereo and visual odometry on a textured plane."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.navigation import visual_odometry
@@ -13,6 +11,7 @@ from marsyard.algorithms.navigation.planner import NavigationOptions, Navigation
 from marsyard.algorithms.navigation.stereo import RectifiedPair
 from marsyard.algorithms.navigation.terrain_map import CELL_M, GroundLimits, TerrainMap
 from marsyard.algorithms.navigation.visual_odometry import VisualOdometryOutcome, estimate_motion
+from marsyard.scenarios.conformance.inputs import MEAN_RADIANCE, TexturedPlane
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, StereoMeasurement
@@ -26,9 +25,11 @@ def _make_pose(east: float, north: float, yaw_deg: float = 0.0) -> RigidTransfor
     return rigid(Rotation.from_euler("Z", yaw_deg, degrees=True), np.array([east, north, 0.0]))
 
 
-def _sample_ground(rocks: tuple[tuple[float, float, float, float], ...] = (), slope_deg: float = 0.0) -> np.ndarray:
+def _sample_ground(
+    rocks: tuple[tuple[float, float, float, float], ...] = (), slope_deg: float = 0.0, half_width_m: float = 9.0
+) -> np.ndarray:
     """Sample a plane that rises to the east, with rocks (east, north, radius, height) as cylinders."""
-    axis = np.arange(-9.0, 9.0, SPACING_M)
+    axis = np.arange(-half_width_m, half_width_m, SPACING_M)
     east, north = (values.ravel() for values in np.meshgrid(axis, axis))
     height = np.tan(np.radians(slope_deg)) * east
     for rock_east, rock_north, radius, rock_height in rocks:
@@ -47,6 +48,11 @@ def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransfor
     return pose * rigid(Rotation.from_rotvec([0.0, 0.0, command.turn_left_rad]), translation)
 
 
+def _navigate(terrain: TerrainMap, east: float, goal_east: float) -> NavigationPlan:
+    """Plan a step of 0.5 m to the east from a position on the east axis."""
+    return navigate(terrain, _make_pose(east, 0.0), np.array([goal_east, 0.0]), 0.5, OPTIONS)
+
+
 def _drive_to_goal(terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float) -> np.ndarray:
     """Drive to the goal with a new plan after each step; return the positions (east, north), metres."""
     positions = [pose.translation[:2]]
@@ -62,12 +68,8 @@ def _drive_to_goal(terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, 
     raise AssertionError("the goal was not reached")
 
 
-def _compute_path_length_m(plan: NavigationPlan) -> float:
-    return sum(command.length_m for command in plan.commands)
-
-
 def test_free_ground_is_crossed_in_a_straight_line() -> None:
-    plan = navigate(_map_ground(), _make_pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
+    plan = _navigate(_map_ground(), 0.0, 5.0)
     assert plan.outcome is NavigationOutcome.PATH
     assert plan.commands == (DriveCommand(forward_m=0.5),)
 
@@ -82,9 +84,9 @@ def test_lateral_goal_is_reached_along_gentle_arcs() -> None:
 
 
 def test_goal_behind_requires_a_turn() -> None:
-    turn_plan = navigate(_map_ground(), _make_pose(0.0, 0.0), np.array([-3.0, 0.0]), 0.5, OPTIONS)
-    assert turn_plan.commands[0].length_m == 0.0
-    assert abs(turn_plan.commands[0].turn_left_rad) > np.radians(90.0)
+    command = _navigate(_map_ground(), 0.0, -3.0).commands[0]
+    assert command.length_m == 0.0
+    assert abs(command.turn_left_rad) > np.radians(90.0)
 
 
 @pytest.mark.parametrize(
@@ -111,28 +113,23 @@ def test_hazard_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> Non
 
 
 def test_low_rocks_are_driven_over() -> None:
-    terrain = _map_ground((3.0, 0.0, 0.25, 0.1))
-    assert navigate(terrain, _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 0.5, OPTIONS).commands == (DriveCommand(0.5),)
+    assert _navigate(_map_ground((3.0, 0.0, 0.25, 0.1)), 0.0, 6.0).commands == (DriveCommand(0.5),)
 
 
 def test_ramp_is_climbed_up_to_the_maximum_tilt() -> None:
-    goal = np.array([5.0, 0.0])
-    outcomes = [
-        navigate(_map_ground(slope_deg=slope), _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome
-        for slope in (25.0, 29.0)
-    ]
-    assert outcomes == [NavigationOutcome.PATH] * 2
+    for slope_deg in (25.0, 29.0):
+        assert _navigate(_map_ground(slope_deg=slope_deg), 0.0, 5.0).outcome is NavigationOutcome.PATH
     # The plan must not enter a ramp of 35 deg, which starts at 2 m.
     points = _sample_ground()
     points[:, 2] = np.tan(np.radians(35.0)) * np.maximum(points[:, 0] - 2.0, 0.0)
     steep = TerrainMap.empty(np.zeros(2)).add_points(points)
-    assert navigate(steep, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    assert _navigate(steep, 0.0, 5.0).outcome is NavigationOutcome.NO_PATH
 
 
 def test_target_rock_is_avoided_unless_it_is_excluded() -> None:
-    terrain, goal, pose = _map_ground((6.0, 0.0, 0.6, 0.8)), np.array([4.8, 0.0]), _make_pose(3.0, 0.0)
-    assert navigate(terrain, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    plan = navigate(terrain.without_hazards(np.array([6.0, 0.0]), 0.8), pose, goal, 0.5, OPTIONS)
+    terrain = _map_ground((6.0, 0.0, 0.6, 0.8))
+    assert _navigate(terrain, 3.0, 4.8).outcome is NavigationOutcome.NO_PATH
+    plan = _navigate(terrain.without_hazards(np.array([6.0, 0.0]), 0.8), 3.0, 4.8)
     assert plan.commands == (DriveCommand(forward_m=0.5),)
 
 
@@ -149,20 +146,19 @@ def _map_stereo_sectors(camera_east_m: float, azimuths_deg: tuple[float, ...], *
 
 def test_path_around_a_hazard_needs_two_mapped_sectors() -> None:
     # The cameras are 2.8 m behind the rover. The rock is 1.2 m ahead, where one sector reaches 1.7 m to each side.
-    rock, goal, pose = (1.2, 0.0, 0.25, 0.4), np.array([6.0, 0.0]), _make_pose(0.0, 0.0)
+    rock, goal = (1.2, 0.0, 0.25, 0.4), np.array([6.0, 0.0])
     one_sector, two_sectors = (_map_stereo_sectors(-2.8, azimuths, rock) for azimuths in ((90.0,), (70.0, 110.0)))
-    assert navigate(one_sector, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    assert _drive_to_goal(two_sectors, pose, goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
+    assert _navigate(one_sector, 0.0, 6.0).outcome is NavigationOutcome.NO_PATH
+    assert _drive_to_goal(two_sectors, _make_pose(0.0, 0.0), goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
     # Without the rock one sector is wide enough.
-    assert navigate(_map_stereo_sectors(-2.8, (90.0,)), pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
+    assert _navigate(_map_stereo_sectors(-2.8, (90.0,)), 0.0, 6.0).outcome is NavigationOutcome.PATH
 
 
 def test_rover_on_unmapped_ground_has_no_path() -> None:
     # The sectors start 1.8 m from the cameras: the ground at 0 m and 1 m is not mapped, the ground at 3 m is.
-    goal, terrain = np.array([7.0, 0.0]), _map_stereo_sectors(0.0, (70.0, 110.0))
-    outcomes = {east: navigate(terrain, _make_pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 3.0)}
-    assert outcomes[0.0] is outcomes[1.0] is NavigationOutcome.NOT_MAPPED
-    assert outcomes[3.0] is NavigationOutcome.PATH
+    terrain = _map_stereo_sectors(0.0, (70.0, 110.0))
+    outcomes = [_navigate(terrain, east, 7.0).outcome for east in (0.0, 1.0, 3.0)]
+    assert outcomes == [NavigationOutcome.NOT_MAPPED] * 2 + [NavigationOutcome.PATH]
 
 
 def test_plan_with_a_long_step_contains_both_arcs_of_the_path() -> None:
@@ -186,17 +182,12 @@ def test_invalid_options_are_rejected() -> None:
 LIMITS = GroundLimits(radius_m=0.7, climb_m=0.2, tilt_rad=float(np.radians(30.0)), roughness_m=0.06)
 EMPTY = TerrainMap.empty(np.zeros(2))
 ORIGIN = np.zeros((1, 2))
-
-
-def _sample_plane(east_slope: float, height: float = 0.0) -> np.ndarray:
-    """Sample a plane within 3 m of the origin every 5 cm; points (east, north, up), metres."""
-    axis = np.arange(-3.0, 3.0, 0.05)
-    east, north = (values.ravel() for values in np.meshgrid(axis, axis))
-    return np.column_stack([east, north, height + east_slope * east])
+#: Level ground within 3 m of the origin; points (east, north, up), metres.
+LEVEL_POINTS = _sample_ground(half_width_m=3.0)
 
 
 def test_plane_has_the_goodness_of_its_tilt() -> None:
-    terrain = EMPTY.add_points(_sample_plane(np.tan(np.radians(15.0))))
+    terrain = EMPTY.add_points(_sample_ground(slope_deg=15.0, half_width_m=3.0))
     # goodness at a tilt of 15 deg and a limit of 30 deg: 1 - 15 / 30; the tolerance covers the slope over half a cell
     assert terrain.goodness(LIMITS).at(ORIGIN)[0] == pytest.approx(0.5, abs=0.01)
     assert np.isnan(EMPTY.goodness(LIMITS).at(ORIGIN)[0])
@@ -204,8 +195,7 @@ def test_plane_has_the_goodness_of_its_tilt() -> None:
 
 @pytest.mark.parametrize("height", [0.3, -0.3])
 def test_rocks_and_holes_are_hazards(height: float) -> None:
-    points = _sample_plane(0.0)
-    points[np.hypot(points[:, 0] - 1.0, points[:, 1]) < 0.25, 2] = height
+    points = _sample_ground(((1.0, 0.0, 0.25, height),), half_width_m=3.0)
     goodness = EMPTY.add_points(points).goodness(LIMITS)
     assert goodness.at(np.array([[1.0, 0.0]]))[0] == 0.0
     assert goodness.hazard_distances_m(ORIGIN)[0] == pytest.approx(1.0, abs=0.25 + CELL_M)
@@ -213,26 +203,26 @@ def test_rocks_and_holes_are_hazards(height: float) -> None:
 
 def test_single_false_match_is_not_a_hazard() -> None:
     outlier = np.array([[0.01, 0.01, 1.5]])
-    goodness = EMPTY.add_points(np.concatenate([_sample_plane(0.0), outlier])).goodness(LIMITS)
+    goodness = EMPTY.add_points(np.concatenate([LEVEL_POINTS, outlier])).goodness(LIMITS)
     assert goodness.at(ORIGIN)[0] == pytest.approx(1.0)
 
 
 def test_new_points_replace_old_ones_and_two_points_do_not_map_a_cell() -> None:
-    terrain = EMPTY.add_points(_sample_plane(0.0)).add_points(_sample_plane(0.0, height=0.4))
+    terrain = EMPTY.add_points(LEVEL_POINTS).add_points(LEVEL_POINTS + np.array([0.0, 0.0, 0.4]))
     assert np.nanmin(terrain.median_m) == pytest.approx(0.4)
     few = EMPTY.add_points(np.array([[0.0, 0.0, 1.0], [0.02, 0.0, 1.0]]))
     assert not few.mapped_cells.any()
 
 
 def test_points_outside_of_the_map_are_ignored() -> None:
-    assert not EMPTY.add_points(_sample_plane(0.0) + np.array([100.0, 0.0, 0.0])).mapped_cells.any()
+    assert not EMPTY.add_points(LEVEL_POINTS + np.array([100.0, 0.0, 0.0])).mapped_cells.any()
     assert np.isnan(EMPTY.goodness(LIMITS).at(np.array([[100.0, 0.0]]))[0])
 
 
 def test_plane_under_the_rover_does_not_replace_measurements() -> None:
     # The rover stands on the plane up = 0.1 east; the southern edge of the map is measured at a height of 1 m.
     normal = np.array([-0.1, 0.0, 1.0])
-    terrain = EMPTY.add_points(_sample_plane(0.0, height=1.0)[:600]).add_plane(np.zeros(3), normal, 1.0)
+    terrain = EMPTY.add_points(LEVEL_POINTS[:600] + np.array([0.0, 0.0, 1.0])).add_plane(np.zeros(3), normal, 1.0)
     row, column = np.argwhere(np.isfinite(terrain.median_m) & (np.abs(terrain.median_m - 1.0) > 0.5))[0]
     east, _ = terrain.corner_m + CELL_M * np.array([column, row])
     assert terrain.median_m[row, column] == pytest.approx(0.1 * east)
@@ -240,14 +230,11 @@ def test_plane_under_the_rover_does_not_replace_measurements() -> None:
 
 
 def test_ground_around_the_target_has_no_hazards() -> None:
-    points = _sample_plane(0.0)
-    points[np.hypot(points[:, 0] - 1.0, points[:, 1]) < 0.5, 2] = 0.6
+    points = _sample_ground(((1.0, 0.0, 0.5, 0.6),), half_width_m=3.0)
     terrain = EMPTY.add_points(points).without_hazards(np.array([1.0, 0.0]), 0.8)
     assert terrain.goodness(LIMITS).at(np.array([[1.0, 0.0]]))[0] > 0.9
 
 
-#: Spacing of the texture's samples on the ground, metres.
-PLANE_SPACING_M = 0.01
 HEIGHT_M, BASELINE_M = 1.5, 0.2  #: Height of the cameras above the ground, and distance between them.
 
 
@@ -261,27 +248,13 @@ def _make_camera(left_m: float, toe_in_deg: float = 0.0) -> Cahv:
 CAMERAS = _make_camera(0.5 * BASELINE_M, -0.5), _make_camera(-0.5 * BASELINE_M, 0.5)
 
 
-def _make_texture(contrast: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    noise = np.random.default_rng(5).standard_normal((1600, 1600))
-    smooth = gaussian_filter(noise, 1.5) + 4.0 * gaussian_filter(noise, 6.0)
-    smooth /= smooth.std()
-
-    def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        rows, columns = y / PLANE_SPACING_M + 800.0, x / PLANE_SPACING_M + 400.0
-        return 1500.0 * (1.0 + contrast * map_coordinates(smooth, [rows, columns], order=1, mode="wrap"))
-
-    return brightness
-
-
-def _render_pair(world_from_rover: RigidTransform, contrast: float = 0.2) -> StereoMeasurement:
+def _render_pair(world_from_rover: RigidTransform, contrast: float = 1.0) -> StereoMeasurement:
     """Render a stereo pair of the plane z = 0; shot noise: the variance in counts is 0.09 (0.3**2) times the counts."""
-    brightness, noise = _make_texture(contrast), np.random.default_rng(1)
+    plane, noise = TexturedPlane(np.zeros(3), np.eye(3)[:2], step_m=0.01), np.random.default_rng(1)
 
     def render(camera: CameraModel) -> np.ndarray:
-        origins, directions = camera.transform(world_from_rover).rays(camera.pixel_grid())
-        distance = -origins[..., 2] / np.minimum(directions[..., 2], -1e-6)
-        points = origins + distance[..., None] * directions
-        mean = brightness(points[..., 0], points[..., 1])
+        relative = plane.radiance(camera.transform(world_from_rover)).astype(np.float64) / MEAN_RADIANCE
+        mean = 1500.0 * (1.0 + contrast * (relative - 1.0))
         return np.rint(mean + 0.3 * np.sqrt(mean) * noise.standard_normal(mean.shape)).astype(np.uint16)
 
     return StereoMeasurement(render(CAMERAS[0]), render(CAMERAS[1]), CAMERAS)
@@ -299,15 +272,13 @@ def _make_prediction(path_fraction: float = 1.0, yaw_error_deg: float = 0.1) -> 
 
 
 def test_rectified_points_are_on_the_plane() -> None:
-    points = RectifiedPair.from_measurement(_render_pair(START)).points(1.2, 5.0)
+    pair = RectifiedPair.from_measurement(_render_pair(START))
+    points = pair.points(1.2, 5.0)
     assert len(points) > 20000
     # one pixel of disparity is 0.4 m in range at 5 m: the height error of a twentieth of a pixel is 6 mm
     assert abs(np.median(points[:, 2])) < 0.003
     assert np.percentile(np.abs(points[:, 2]), 90.0) < 0.03
-
-
-def test_limits_of_depth_are_respected() -> None:
-    pair = RectifiedPair.from_measurement(_render_pair(START))
+    # limits of depth
     depth = (pair.points(1.2, 3.0) - pair.camera.c) @ pair.camera.a
     assert depth.max() <= 3.0 + 1e-9
     assert depth.min() > 1.2

@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -34,8 +35,6 @@ from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, Descent
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
-#: Start of a program: imports, and the line that reports that it is ready.
-READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 3, 'ready': True}), flush=True)\n"
 
 
 def make_estimate(*span_s: float) -> VelocityEstimate:
@@ -245,39 +244,25 @@ def make_stream(spec: str) -> ExecutableAlgorithm:
     return ExecutableAlgorithm(command, ExecutableLimits(time_s=60.0), VELOCITY_STREAM.requests)
 
 
-def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Import the example, and make Marsyard's packages importable in programs."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    ChainedShifts = importlib.import_module("velocity_stream").ChainedShifts
+    return importlib.import_module("velocity_stream")
 
-    measurements = inputs.descent(5)
-    reference = estimate(ChainedShifts(), measurements)
+
+def test_example_returns_equal_estimates_in_python_and_as_program(example: ModuleType) -> None:
+    measurements = inputs.inertial_descent(5)
+    reference = estimate(example.ChainedShifts(), measurements)
     assert reference.velocity_m_s is not None
     error = reference.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2]
     # Errors are within three standard deviations, which are below 1 m/s.
     assert reference.covariance_m2_s2 is not None
     assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(reference.covariance_m2_s2)))
     assert np.all(np.diag(reference.covariance_m2_s2) < 1.0)
-    program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
-    for _ in range(2):
-        actual = estimate(program, measurements)
-        np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
-        np.testing.assert_allclose(actual.covariance_m2_s2, reference.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
-        assert actual.span_s == reference.span_s == (107.5, 107.5)
-        assert [item is None for item in actual.after_images] == [True, False, False, False, False]
-        assert isinstance(actual.details, ProgramDetails)
-        assert actual.details.time_s > 0.0
-    end_idle_programs()
-
-
-def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The increments are exact: the integrated velocities equal the inertial velocities of the frames."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    example = importlib.import_module("velocity_stream")
-    measurements = inputs.inertial_descent(5)
-    expected = estimate(example.ChainedShifts(), measurements)
-    # the inertial velocities of later frames are wrong and must not be used
+    # The increments are exact: the integrated velocities equal the inertial velocities of the frames. The inertial
+    # velocities of later frames are wrong and must not be used.
     velocities = measurements.inertial_velocities_m_s
     assert velocities is not None
     wrong = replace(
@@ -285,26 +270,28 @@ def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pyt
         inertial_velocities_m_s=velocities + 50.0 * (np.arange(5.0) > 0.0)[:, None],
         interval_velocities_m_s=measurements.interval_velocities_m_s + 50.0,
     )
-    reference = estimate(example.IntegratedShifts(), wrong)
-    np.testing.assert_allclose(reference.velocity_m_s, expected.velocity_m_s, atol=1e-6)  # type: ignore[arg-type]
-    program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'} --increments")
-    for _ in range(2):
-        actual = estimate(program, wrong)
-        np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
-    end_idle_programs()
+    integrated = estimate(example.IntegratedShifts(), wrong)
+    np.testing.assert_allclose(integrated.velocity_m_s, reference.velocity_m_s, atol=1e-6)  # type: ignore[arg-type]
+    for option, case, expected in (("", measurements, reference), (" --increments", wrong, integrated)):
+        program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}{option}")
+        for _ in range(2):
+            actual = estimate(program, case)
+            np.testing.assert_allclose(actual.velocity_m_s, expected.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
+            np.testing.assert_allclose(actual.covariance_m2_s2, expected.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
+            assert actual.span_s == expected.span_s == (107.5, 107.5)
+            assert [item is None for item in actual.after_images] == [True, False, False, False, False]
+            assert isinstance(actual.details, ProgramDetails)
+            assert actual.details.time_s > 0.0
+        end_idle_programs()
 
 
-def format_server(answers: list[str]) -> str:
-    """Return a program that sends fixed answers without evaluating its requests."""
-    return (
-        f"{READY}for answer in {answers}:"
-        + """
+#: A program that sends fixed answers without evaluating its requests.
+SERVER = """import json, sys
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
+for answer in ANSWERS:
     identity = '"exchange": 3, "id": %d' % json.loads(sys.stdin.readline())["id"]
     print(answer.replace('"exchange": 3', identity), flush=True)
 """
-    )
-
-
 #: Answer to an image, before the first velocity.
 NO_VELOCITY_YET = '{"exchange": 3, "outcome": null}'
 
@@ -335,7 +322,7 @@ NO_VELOCITY_YET = '{"exchange": 3, "outcome": null}'
     ],
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
-    (tmp_path / "stream.py").write_text(format_server(answers))
+    (tmp_path / "stream.py").write_text(SERVER.replace("ANSWERS", repr(answers)))
     with pytest.raises(AlgorithmError, match=message) as error:
         estimate(make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}"), inputs.descent(3))
     assert error.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)

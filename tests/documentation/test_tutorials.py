@@ -1,5 +1,7 @@
-"""Tests that the commands of each tutorial succeed in an empty folder, in the order of the page."""
+"""Tests of the pages to try out: the commands of each tutorial succeed in an empty folder, and notebooks run."""
 
+import ast
+import json
 import os
 import re
 import shlex
@@ -14,7 +16,7 @@ from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 CODE_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: End of the text before a code block that is saved to a file.
@@ -118,3 +120,30 @@ def _run_in_subprocess(arguments: list[str], allowed_codes: set[int]) -> None:
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode in allowed_codes, f"{arguments}: {result.returncode}\n{result.stdout}\n{result.stderr}"
     assert "Traceback" not in result.stderr
+
+
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+names = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+@names
+def test_notebook_is_stored_without_output(path: Path) -> None:
+    notebook = json.loads(path.read_text())
+    assert path.stat().st_size < 10_000
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == []
+            assert cell["execution_count"] is None
+            ast.parse("".join(cell["source"]))
+
+
+@pytest.mark.slow
+@names
+def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    monkeypatch.setenv("PYTHONPATH", str(DOCS.parent))
+    notebook = nbformat.read(path, as_version=4)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any("text/html" in output.get("data", {}) for output in outputs)

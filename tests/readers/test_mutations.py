@@ -306,7 +306,7 @@ _SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.function_
 
 
 @pytest.mark.parametrize("name", READERS)
-@settings(_SETTINGS, max_examples=12, derandomize=True)
+@settings(_SETTINGS, max_examples=8, derandomize=True)
 @given(mutate=mutations())
 def test_damaged_files_raise_the_documented_error(name: str, mutate: Callable[[bytes], bytes], tmp_path: Path) -> None:
     _read_mutated(name, mutate, tmp_path)
@@ -367,7 +367,7 @@ def test_times_beyond_64_bits_are_reported(tmp_path: Path) -> None:
         read_poses(path)
 
 
-@pytest.mark.parametrize("delay_s", [0.1, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("delay_s", [0.1, 0.6])
 def test_interrupt_in_the_first_second_prints_no_traceback(delay_s: float) -> None:
     """Ctrl-C while modules are imported; before Python handles signals, the signal itself ends the process."""
     command = [sys.executable, "-m", "marsyard", "show", "dimes-smoke"]

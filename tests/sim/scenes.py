@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor
@@ -41,6 +42,13 @@ def rocks_near(field: RockField, x_m: float, y_m: float, radius_m: float, above_
     """Return the rocks around a position as objects."""
     mesh = field.near(x_m, y_m, radius_m, above_m=above_m)
     return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
+
+
+def mesh_body(mesh: trimesh.Trimesh, name: int = 0) -> Objects:
+    """Return a closed mesh as a body with this name and the albedo 0.2."""
+    names = np.full(len(mesh.faces), name, dtype=np.int32)
+    vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
+    return Objects.of_mesh(vertices, normals, mesh.faces.astype(np.int32), names, albedo=0.2)
 
 
 def level_plate(name: int, middle_m: float = 8.0) -> Objects:

@@ -10,7 +10,6 @@ from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.localisation.camera import LANDER_DETECTOR
 from marsyard.scenarios.localisation.instruments import RADAR
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.systems import catalogue
 from marsyard.sim.parameters import merge_parameters
 from marsyard.sim.sensor import ImuParameters
 
@@ -25,7 +24,11 @@ def _list_single_values(model: BaseModel) -> Iterator[Mapping[str, object]]:
             yield from ({name: table} for table in _list_single_values(value))
 
 
-@pytest.mark.parametrize("name", sorted(catalogue()))
+#: A campaign of each scenario; presets are in its parameters and in its file.
+CAMPAIGNS = ("dimes-offnominal", "dimes-fieldtest", "vtt-montecarlo", "vtt-turn", "hda-faults", "loc-jezero")
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
 def test_a_value_that_is_set_to_itself_changes_nothing(name: str) -> None:
     campaign = load_campaign(name)
     parameters = campaign.base_parameters()

@@ -105,6 +105,11 @@ def test_blended_numbers_change_continuously() -> None:
         assert np.corrcoef(older, blended)[0, 1] == pytest.approx(np.sqrt(1.0 - step**2), abs=0.02)
     newest = Streams(5, "campaign", 8, ((8, 1.0),)).generator("detector").standard_normal((400, 400), dtype=np.float32)
     np.testing.assert_array_equal(_blended(0.3, "detector").standard_normal((400, 400), dtype=np.float32), newest)
+    # one component has the numbers of its case
+    alone, blended = (
+        Streams(5, "campaign", 8, *blend).generator("imu").standard_normal(10) for blend in ((), (((8, 1.0),),))
+    )
+    np.testing.assert_array_equal(blended, alone)
 
 
 def test_components_do_not_depend_on_the_other_draws_of_a_case() -> None:
@@ -131,8 +136,3 @@ def test_blended_numbers_have_the_shapes_of_numpy() -> None:
     assert generator.standard_normal((2, 2), dtype=np.float32).dtype == np.float32
     assert 0 <= int(generator.integers(10)) < 10
     assert [child.random() for child in generator.spawn(2)] != [generator.random()] * 2
-
-
-def test_one_component_has_the_numbers_of_its_case() -> None:
-    alone = Streams(5, "campaign", 8).generator("imu").standard_normal(10)
-    np.testing.assert_array_equal(Streams(5, "campaign", 8, ((8, 1.0),)).generator("imu").standard_normal(10), alone)

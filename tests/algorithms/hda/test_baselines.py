@@ -13,7 +13,7 @@ from marsyard.algorithms.hda.baselines import (
 )
 from marsyard.algorithms.hda.estimator import motion_from_tracks
 from marsyard.algorithms.hda.scene import LandingScene, build_scene
-from marsyard.algorithms.hda.tracking import select_features, track_features
+from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
@@ -38,6 +38,13 @@ def landing_scene(measurements: LandingMeasurements) -> LandingScene:
     return build_scene(measurements)
 
 
+@pytest.fixture(scope="module")
+def tracks(landing_scene: LandingScene) -> Tracks:
+    features = select_features(landing_scene.views[0].counts, OPTIONS)
+    first, second = (view.counts for view in landing_scene.views)
+    return track_features(first, second, features, features, 40, OPTIONS)
+
+
 @pytest.mark.slow
 def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_scene: LandingScene) -> None:
     true_motion = make_scene().second_from_first
@@ -53,10 +60,7 @@ def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_sc
 
 
 @pytest.mark.slow
-def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> None:
-    features = select_features(landing_scene.views[0].counts, OPTIONS)
-    first, second = (view.counts for view in landing_scene.views)
-    tracks = track_features(first, second, features, features, 40, OPTIONS)
+def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene, tracks: Tracks) -> None:
     motion = motion_from_tracks(landing_scene, tracks, OPTIONS)
     scene = make_scene()
     # Scale the baseline, whose length is not determined by images, to its true length.
@@ -74,10 +78,7 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
 
 
 @pytest.mark.slow
-def test_essential_matrix_motion_matches_exact_scene(landing_scene: LandingScene) -> None:
-    features = select_features(landing_scene.views[0].counts, OPTIONS)
-    first, second = (view.counts for view in landing_scene.views)
-    tracks = track_features(first, second, features, features, 40, OPTIONS)
+def test_essential_matrix_motion_matches_exact_scene(landing_scene: LandingScene, tracks: Tracks) -> None:
     result = essential_motion(landing_scene, tracks, OPTIONS)
     true_motion = make_scene().second_from_first
     assert np.rad2deg((result.second_from_first.rotation * true_motion.rotation.inv()).magnitude()) < 0.2

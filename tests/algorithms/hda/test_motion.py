@@ -6,7 +6,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda import CameraMotion, HdaOptions
 from marsyard.algorithms.hda.estimator import check_motion
-from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.motion import MotionStart, estimate_motion, plane_depths, range_starts
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
@@ -151,18 +150,6 @@ def test_tracks_without_rigid_motion_are_rejected() -> None:
         result = solve_motion(points, points + rng.normal(0.0, 60.0 / FOCAL_PX, points.shape))
         assert check_motion(result, OPTIONS) in (SiteOutcome.NO_MOTION, SiteOutcome.NO_BASELINE)
     assert check_motion(None, OPTIONS) is SiteOutcome.NO_MOTION
-
-
-def test_residuals_are_reprojection_errors_in_pixels() -> None:
-    rng = np.random.default_rng(9)
-    points, depths = make_tracks(rng, 0.05)
-    true_motion = draw_motion(rng)
-    second = project_points(points, depths, true_motion) + 0.01
-    motion = kernels.MotionArrays(
-        true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths
-    )
-    residuals = kernels.residuals(kernels.MatchArrays(points, second, FOCAL_PX, 1.0), motion)
-    np.testing.assert_allclose(residuals, -0.01 * FOCAL_PX, rtol=1e-9)
 
 
 def test_slant_range_alone_determines_a_motion_by_the_baseline_of_the_campaigns() -> None:

@@ -180,9 +180,15 @@ def test_wrong_fix_is_discarded_and_the_coarse_stage_restarts(make_stages: Calla
     _check_error(estimates[-1])
 
 
-def test_contradicting_landmarks_are_failures(make_stages: Callable[..., Stages]) -> None:
-    """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: no position is reported."""
-    make_stages([ERROR_M[:2] + np.array([-160.0, 0.0])], [True] * 3)
+@pytest.mark.parametrize(("error_m", "fine"), [([-160.0, 0.0], True), ([0.0, 150.0], np.radians([5.0, 0.0, 0.0]))])
+def test_contradicting_landmarks_are_failures(
+    error_m: list[float], fine: bool | np.ndarray, make_stages: Callable[..., Stages]
+) -> None:
+    """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: no position is reported.
+
+    Or all landmarks show a tilt of 5 deg, 87 standard deviations; a subset near the nadir fits the wrong state.
+    """
+    make_stages([ERROR_M[:2] + np.array(error_m)], [fine] * 3)
     estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
     assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
 
@@ -195,13 +201,6 @@ def test_no_position_after_contradicting_landmarks_until_the_next_update(make_st
     assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 2 + [INCONSISTENT] * 2 + [VALID] * 2
     assert estimates[4].position_m is None
     _check_error(estimates[6])
-
-
-def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Callable[..., Stages]) -> None:
-    """All landmarks show a tilt of 5 deg, 87 standard deviations; a subset near the nadir fits the wrong state."""
-    make_stages([ERROR_M[:2] + np.array([0.0, 150.0])], [np.radians([5.0, 0.0, 0.0])] * 3)
-    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
-    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
 
 
 def test_position_without_a_recent_update_is_uncertain(make_stages: Callable[..., Stages]) -> None:

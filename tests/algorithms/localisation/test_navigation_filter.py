@@ -1,7 +1,6 @@
 """Tests of the navigation filter for localisation on a map: an analytic descent with exact inertial increments."""
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -160,70 +159,28 @@ def state_difference(plus: NavigationState, minus: NavigationState) -> np.ndarra
     )
 
 
-def test_transition_matches_numerical_differences(truth: Descent, exact: ImuIncrements) -> None:
-    """One step of 0.1 s and 40 steps, element by element."""
-    start = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
-    history = IncrementHistory(exact.times_s, exact.period_s, exact.delta_angles_rad, exact.delta_velocities_m_s)
-    times, gravity, step = 0.1 * np.arange(1, 41), np.array([0.0, 0.0, -GRAVITY]), 0.1
-
-    def propagate(errors: np.ndarray) -> list[NavigationState]:
-        changed = start.correct(errors, np.eye(15))
-        return inertial.propagate_states(changed, history, times, GRAVITY, ImuErrorModel())
-
-    transitions = []
-    states = [start, *propagate(np.zeros(15))]
-    for before, after in pairwise(states):
-        rotations = truth.motion(np.linspace(before.time_s, after.time_s, 41)).attitudes.as_matrix()
-        moved = after.position_m - before.position_m - before.velocity_m_s * step
-        transitions.append(
-            inertial.compute_transition(
-                after.velocity_m_s - before.velocity_m_s - gravity * step,
-                moved - 0.5 * gravity * step**2,
-                np.asarray(np.trapezoid(rotations, dx=step / 40, axis=0)),
-                step,
-            )
-        )
-    total = np.linalg.multi_dot(transitions[::-1])
-    sizes = np.repeat([1.0, 1.0, 1e-4, 1e-4, 1e-2], 3)
-    for column in range(15):
-        error = sizes[column] * np.eye(15)[column]
-        plus, minus = propagate(error), propagate(-error)
-        for number, analytic, tolerance in ((0, transitions[0], 0.05), (39, total, 2e-3)):
-            numeric = state_difference(plus[number], minus[number]) / (2.0 * sizes[column])
-            for first in range(0, 15, 3):
-                rows = slice(first, first + 3)
-                expected = analytic[rows, column]
-                block = analytic[rows, 3 * (column // 3) : 3 * (column // 3) + 3]
-                # Effects of biases on position and velocity: the increments' sums neglect a gyro bias within an
-                # interval (1.5 / 40 of the first step, 1.5 / 1600 of all), and rotation in a step. Others: rounding.
-                # Relative to the largest element of the block of three columns.
-                is_bias = column >= 9 and first < 6
-                allowed = (tolerance if is_bias else 1e-6) * np.abs(block).max() + 1e-9
-                assert np.abs(numeric[rows] - expected).max() < allowed, (number, column, first)
-
-
 def test_propagated_covariance_equals_that_of_the_transition(truth: Descent, exact: ImuIncrements) -> None:
-    """The propagated covariance of a single error is the square of its propagated difference."""
+    """The propagated covariance of a single error is the square of its propagated difference: 1 step, and 40 steps."""
     noise_free = ImuErrorModel(
         **dict.fromkeys(ImuErrorModel.__dataclass_fields__, 0.0) | {"gyro_wander_s": 1.0, "accelerometer_wander_s": 1.0}
     )
     start = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
     history = IncrementHistory(exact.times_s, exact.period_s, exact.delta_angles_rad, exact.delta_velocities_m_s)
     times = 0.1 * np.arange(1, 41)
-    for column, size in ((4, 1.0), (7, 1e-4), (9, 1e-4), (13, 1e-2)):
+    for column, size in enumerate(np.repeat([1.0, 1.0, 1e-4, 1e-4, 1e-2], 3)):
         error = size * np.eye(15)[column]
         single = replace(start, covariance=np.outer(error, error))
-        result = inertial.propagate_states(single, history, times, GRAVITY, noise_free)[-1]
-        ends = (
-            inertial.propagate_states(start.correct(sign * error, np.eye(15)), history, times, GRAVITY, noise_free)[-1]
-            for sign in (1.0, -1.0)
+        results, plus, minus = (
+            inertial.propagate_states(state, history, times, GRAVITY, noise_free)
+            for state in (single, *(start.correct(sign * error, np.eye(15)) for sign in (1.0, -1.0)))
         )
-        numeric = 0.5 * state_difference(*ends)
-        for first in range(0, 15, 3):
-            rows = slice(first, first + 3)
-            expected = np.outer(numeric[rows], numeric[rows])
-            # twice the tolerance of the transition
-            assert np.abs(result.covariance[rows, rows] - expected).max() <= 4e-3 * np.abs(expected).max() + 1e-20
+        # Increments' sums neglect a gyro bias within an interval: 1.5 / 40 of the first step, and 1.5 / 1600 of all.
+        for step, tolerance in ((0, 0.1), (-1, 4e-3)):
+            numeric = 0.5 * state_difference(plus[step], minus[step])
+            # relative to the vector of each state
+            scale = np.repeat(np.abs(numeric.reshape(5, 3)).max(axis=1), 3)
+            difference = np.abs(results[step].covariance - np.outer(numeric, numeric))
+            assert np.all(difference <= tolerance * np.outer(scale, scale) + 1e-20), (column, step)
 
 
 def test_landmark_jacobian_matches_numerical_differences(truth: Descent) -> None:
@@ -396,7 +353,7 @@ def test_estimates_are_consistent(truth: Descent, exact: ImuIncrements) -> None:
         assert low < nees / (size * runs) < high
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) -> None:
     """30 % of 150 landmarks are wrong by up to 40 pixels, within the uncertainty before the update."""
     rng = np.random.default_rng([seed, 6])

@@ -1,4 +1,4 @@
-"""Tests of external programs as position estimators: exchanged values, answers, separate processes, and faults."""
+"""Tests of position answers: exchanged values, validation, external programs, separate processes, and faults."""
 
 import gc
 import io
@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,13 @@ from marsyard.algorithms.exchange.serving import end_idle_programs, idle_process
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.baselines import InertialEstimator
-from marsyard.algorithms.localisation.exchange import POSITION_FORM, POSITION_STREAM, read_map, write_map
+from marsyard.algorithms.localisation.exchange import (
+    POSITION_FORM,
+    POSITION_STREAM,
+    check_estimate,
+    read_map,
+    write_map,
+)
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.algorithm_run import run_algorithm
@@ -162,11 +169,6 @@ for line in sys.stdin:
 """
 
 
-def write_plain(folder: Path, body: str) -> str:
-    """Write `PLAIN` with `body` as the line that each request runs."""
-    return write_program(folder, PLAIN.replace("# BODY", body))
-
-
 #: Requests of `DESCENT` in their order.
 CALLS = ["start", "process_increments", "process_altitude", "process_increments", "process_image"]
 CALLS += ["process_increments", "finish"]
@@ -174,7 +176,7 @@ CALLS += ["process_increments", "finish"]
 
 def test_process_answers_one_descent_or_many_in_order_of_messages(tmp_path: Path) -> None:
     body = "print(actions, os.getpid(), file=sys.stderr, flush=True) if request['do'] == 'finish' else None"
-    program = write_plain(tmp_path, body)
+    program = write_program(tmp_path, PLAIN.replace("# BODY", body))
     outputs = [run(f"{prefix}:{program}").details for prefix in ("serve", "serve", "exec")]
     actions, process_ids = zip(*(item.stderr.rsplit(" ", 1) for item in outputs if item is not None), strict=True)
     assert set(actions) == {repr(CALLS)}
@@ -188,8 +190,6 @@ def test_process_answers_one_descent_or_many_in_order_of_messages(tmp_path: Path
 
 #: A line for `PLAIN` that makes the answers to image and finish valid.
 VALID = 'answer = {**answer, **STATE, "outcome": "VALID"} if "outcome" in answer and answer["outcome"] else answer'
-
-
 IF_IMAGE = "if request['do'] == 'process_image': "
 
 
@@ -212,14 +212,12 @@ IF_IMAGE = "if request['do'] == 'process_image': "
         (f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': float('nan')}}", Fault.BAD_ANSWER, "time_s is 'NaN'; allowed"),
         (f"{IF_IMAGE}answer = {{**ANSWER, 'position': 1}}", Fault.BAD_ANSWER, "unknown key 'position'"),
         (f"{IF_IMAGE}answer = {{**ANSWER, 'outcome': 'VALID'}}", Fault.BAD_ANSWER, "VALID, but position_m is missing"),
-        (f"{IF_IMAGE}answer = {{**ANSWER, **STATE}}", Fault.BAD_ANSWER, "NO_COARSE_FIX, but position_m is given"),
-        (f"{VALID}; STATE['covariance'][0][0] = -1.0", Fault.BAD_ANSWER, "covariance is not positive definite"),
         (f"{VALID}; STATE['world_from_body_xyzw'] = [0] * 4", Fault.BAD_ANSWER, "allowed: a unit quaternion"),
         (f"{VALID}; STATE['velocity_m_s'] = [1, 2]", Fault.BAD_ANSWER, "velocity_m_s is '.1, 2.'; allowed: numbers"),
     ],
 )
 def test_failures_of_a_program_are_faults(tmp_path: Path, body: str, fault: Fault, message: str) -> None:
-    spec = f"serve:{write_plain(tmp_path, body)}"
+    spec = f"serve:{write_program(tmp_path, PLAIN.replace('# BODY', body))}"
     start_s = time.monotonic()
     limits = {"time_s": 0.5} if fault is Fault.TIMED_OUT else {}
     with pytest.raises(AlgorithmError, match=message) as error:
@@ -229,7 +227,7 @@ def test_failures_of_a_program_are_faults(tmp_path: Path, body: str, fault: Faul
 
 
 def test_a_failure_in_a_case_is_recorded_as_an_outcome(tmp_path: Path) -> None:
-    spec = f"serve:{write_plain(tmp_path, 'sys.exit(repr(actions))')}"
+    spec = "serve:" + write_program(tmp_path, PLAIN.replace("# BODY", "sys.exit(repr(actions))"))
     algorithm_run = run_algorithm(lambda: run(spec), lambda answer: answer)
     assert algorithm_run.failure.outcome == "CRASHED"
     assert algorithm_run.row["stderr"] == "['start']\n"
@@ -240,3 +238,98 @@ def test_serve_rejects_an_unknown_request() -> None:
     with pytest.raises(ValueError, match="unknown request 'image'; allowed: start, process_inc"):
         POSITION_STREAM.serve(InertialEstimator(), ['{"exchange": 3, "id": 1, "do": "image"}\n'], answers)
     assert json.loads(answers.getvalue()) == {"exchange": 3, "ready": True}
+
+
+#: Fields of the state, which a valid answer contains and a refusal does not.
+STATE_FIELDS = ("position_m", "velocity_m_s", "world_from_body", "covariance")
+
+
+def _make_valid() -> PositionEstimate:
+    position, velocity = np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.0, -90.0])
+    return PositionEstimate(
+        PositionOutcome.VALID, 12.5, position, velocity, Rotation.from_rotvec([0.1, 0.0, 0.2]), np.eye(9), details="d"
+    )
+
+
+class _Malformed(PositionEstimate):
+    """A `PositionEstimate` whose fields are not checked at creation, as without the run-time checks of the tests."""
+
+    def __init__(self, **changes: object) -> None:
+        for name, value in {**vars(_make_valid()), **changes}.items():
+            object.__setattr__(self, name, value)
+
+
+def _expect_bad(answer: object, message: str) -> None:
+    """Assert that the answer raises BAD_ANSWER with this message on one line."""
+    with pytest.raises(AlgorithmError, match=message) as caught:
+        check_estimate(answer)
+    assert caught.value.fault is Fault.BAD_ANSWER
+    assert "\n" not in str(caught.value)
+
+
+def test_values_of_another_type_are_refused() -> None:
+    for answer in (None, 3.0, SimpleNamespace(**vars(_make_valid())), PositionOutcome.VALID):
+        _expect_bad(answer, rf"the answer is a {type(answer).__name__}; allowed: a PositionEstimate")
+    for outcome in ("VALID", None, 1):
+        _expect_bad(_Malformed(outcome=outcome), rf"outcome is a {type(outcome).__name__}; allowed: a PositionOutcome")
+    for time_s in (np.nan, np.inf, None, "12.5", np.array(12.5)):
+        _expect_bad(_Malformed(time_s=time_s), r"time_s is .*; allowed: a finite number")
+
+
+@pytest.mark.parametrize("name", STATE_FIELDS)
+def test_valid_answers_have_all_state_fields_and_refusals_none(name: str) -> None:
+    _expect_bad(_Malformed(**{name: None}), rf"outcome is VALID, but {name} is missing; allowed: all parts")
+    no_state: dict[str, Any] = dict.fromkeys(STATE_FIELDS)
+    fields = {**no_state, name: getattr(_make_valid(), name)}
+    for outcome in set(PositionOutcome) - {PositionOutcome.VALID}:
+        _expect_bad(_Malformed(outcome=outcome, **fields), rf"outcome is {outcome.name}, but {name} is given; allowed")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("position_m", np.zeros(2), r"position_m has the shape \(2,\); allowed: \(3,\)"),
+        ("position_m", np.zeros((3, 1)), r"position_m has the shape \(3, 1\); allowed: \(3,\)"),
+        ("position_m", [1.0, 2.0, 3.0], r"position_m is a list; allowed: a NumPy array of floats"),
+        ("position_m", np.arange(3), r"position_m is an array of int64; allowed: a NumPy array of floats"),
+        ("position_m", np.array([1.0, np.nan, 0.0]), r"position_m is not finite: \[1.0, nan, 0.0\]"),
+        ("velocity_m_s", np.zeros(4), r"velocity_m_s has the shape \(4,\); allowed: \(3,\)"),
+        ("velocity_m_s", np.array([np.inf, 0.0, 0.0]), r"velocity_m_s is not finite"),
+        ("world_from_body", np.eye(3), r"world_from_body is a ndarray; allowed: a Rotation"),
+        ("world_from_body", Rotation.from_rotvec(np.zeros((2, 3))), r"world_from_body contains 2 rotations; allowed"),
+        ("covariance", np.eye(3), r"covariance has the shape \(3, 3\); allowed: \(9, 9\)"),
+        ("covariance", np.full((9, 9), np.nan), r"covariance is not finite"),
+        ("covariance", np.eye(9) + np.eye(9, k=1), r"covariance is not symmetric"),
+        ("covariance", np.zeros((9, 9)), r"covariance is not positive definite"),
+        ("covariance", np.diag([1.0] * 8 + [-1.0]), r"covariance is not positive definite"),
+    ],
+)
+def test_malformed_state_is_refused(name: str, value: object, message: str) -> None:
+    _expect_bad(_Malformed(**{name: value}), message)
+
+
+def test_valid_answer_is_copied() -> None:
+    """A later change of the algorithm's arrays does not change the copy."""
+    answer = replace(_make_valid(), time_s=-0.2)
+    checked = check_estimate(answer)
+    assert checked.outcome is PositionOutcome.VALID
+    assert (checked.details, checked.time_s) == ("d", -0.2)
+    for name in ("position_m", "velocity_m_s", "covariance"):
+        original = getattr(answer, name)
+        expected = original.copy()
+        original += 100.0
+        np.testing.assert_array_equal(getattr(checked, name), expected)
+        assert getattr(checked, name).dtype == np.float64
+    assert checked.world_from_body.approx_equal(Rotation.from_rotvec([0.1, 0.0, 0.2]), atol=1e-12)
+    # other types of numbers are converted
+    single = np.array([1.0, 2.0, 3.0], dtype=np.float32)
+    converted = check_estimate(_Malformed(position_m=single, time_s=3))
+    assert (converted.position_m.dtype, type(converted.time_s)) == (np.float64, float)
+
+
+def test_refusal_without_a_state_is_valid() -> None:
+    for outcome in set(PositionOutcome) - {PositionOutcome.VALID}:
+        answer = PositionEstimate(outcome, 2.0, details=("diagnosis",))
+        checked = check_estimate(answer)
+        assert checked == answer
+        assert checked is not answer

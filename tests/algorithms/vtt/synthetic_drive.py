@@ -1,10 +1,9 @@
-"""Synthetic mast images and drives for the tests of target tracking: a rover among textured planes and spheres.
+"""Synthetic mast images and drives for the tests of target tracking: a rover among textured planes.
 
 The ray of each pixel is intersected with the nearest body. The solid texture is a sum of plane waves; each wave is
 averaged over the pixel extent in closed form, so that the images have no aliasing.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -93,27 +92,10 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Sphere:
-    """A sphere in the world."""
-
-    centre: np.ndarray
-    radius: float
-
-    def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Compute the distance along each ray, metres; NaN where the ray misses."""
-        # |offset + distance direction|**2 = radius**2 is a quadratic equation; the smaller root is the front side
-        offset = origins - self.centre
-        half_linear = np.sum(offset * directions, axis=-1)
-        discriminant = half_linear * half_linear - np.sum(offset * offset, axis=-1) + self.radius**2
-        with np.errstate(invalid="ignore"):
-            return np.asarray(-half_linear - np.sqrt(discriminant))
-
-
-@dataclass(frozen=True)
 class Scene:
     """Bodies with one texture; the nearest occludes the others. Wave phases are relative to `origin`."""
 
-    bodies: tuple[Plane | Sphere, ...]
+    bodies: tuple[Plane, ...]
     texture: Waves
     origin: np.ndarray
     contrast: float = 0.15
@@ -218,9 +200,6 @@ class Drive:
 #: Options with a smaller search window than the paper's, so that smaller subframes are rendered.
 SMALL_WINDOW = VttOptions(search_px=101, warp="bend")
 
-#: Function of a seed and the target's position that returns a body with the target on its surface.
-MakeBody = Callable[[int, np.ndarray], Plane | Sphere]
-
 
 def make_face(seed: int, target: np.ndarray) -> Plane:
     """Create a plane rock face through the target with a random tilt, visible to a rover at the origin."""
@@ -229,15 +208,7 @@ def make_face(seed: int, target: np.ndarray) -> Plane:
     return Plane(target, normal / np.linalg.norm(normal))
 
 
-def make_boulder(seed: int, target: np.ndarray) -> Sphere:
-    """Create a sphere of 0.3 to 0.6 m radius with the target on its front."""
-    rng = np.random.default_rng(seed)
-    normal = np.array([-1.0, rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8)])
-    radius = rng.uniform(0.3, 0.6)
-    return Sphere(target - radius * normal / np.linalg.norm(normal), radius)
-
-
-def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
+def make_scene(body: Plane, target: np.ndarray, seed: int) -> Scene:
     """Create a scene of one body with a random texture."""
     return Scene((body,), draw_waves(seed, count=100), target)
 

@@ -1,4 +1,4 @@
-"""Tests of the target tracker in the loop of drive, images and update, on exact images of planes and spheres."""
+"""Tests of the target tracker in the loop of drive, images and update, on exact images of planes."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -15,14 +15,12 @@ from marsyard.sim.measurements import MastImage, PixelTarget, RoverTarget, SiteT
 from tests.algorithms.vtt.synthetic_drive import (
     SMALL_WINDOW,
     Drive,
-    MakeBody,
     Plane,
     Scene,
     draw_waves,
     drive_to_target,
     get_details,
     get_pixel,
-    make_boulder,
     make_face,
     make_scene,
     navcam,
@@ -35,19 +33,14 @@ from tests.algorithms.vtt.synthetic_drive import (
 
 
 @pytest.mark.parametrize(
-    ("fraction", "make_body", "seeds"),
-    [
-        (0.1, make_face, range(3)),
-        pytest.param(0.1, make_boulder, range(3), marks=pytest.mark.slow),
-        pytest.param(0.05, make_face, range(10, 11), marks=pytest.mark.slow),
-    ],
+    ("fraction", "seeds"), [(0.1, range(3)), pytest.param(0.05, range(10, 11), marks=pytest.mark.slow)]
 )
-def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_body: MakeBody, seeds: range) -> None:
+def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, seeds: range) -> None:
     # Requirement without noise: 1 px rms, 2.5 px maximum. An error of one pixel at 10 m grows to 5 px at 2 m.
     drifts = []
     for seed in seeds:
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
-        drive = Drive(make_scene(make_body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
+        drive = Drive(make_scene(make_face(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
         stops = drive_to_target(drive, target, fraction)
         true_pose, last = stops[-1]
         assert last.tracked
@@ -67,32 +60,15 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
 
 @pytest.mark.slow
 def test_published_tracker_drifts_by_a_few_pixels() -> None:
-    """The quadratic fit of the correlation peak has an error of a tenth of a pixel, which later steps magnify."""
-    drifts = []
+    """Each of 32 steps adds an error of up to half a pixel (0.4 px rms): about 6 px in total."""
+    options, drifts = replace(SMALL_WINDOW, subpixel=False, min_match_score=0.0), []
     for seed in range(3):
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
-        tracker = VisualTargetTracker(replace(SMALL_WINDOW, warp="none"))
-        drive = Drive(make_scene(make_boulder(seed, target), target, seed), navcam(), tracker)
-        true_pose, last = drive_to_target(drive, target, 0.1)[-1]
+        drive = Drive(make_scene(make_face(seed, target), target, seed), navcam(), VisualTargetTracker(options))
+        true_pose, last = drive_to_target(drive, target, 0.05)[-1]
         assert last.tracked
         drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
-    assert 0.3 < np.sqrt(np.mean(np.square(drifts))) < 10.0
-
-
-@pytest.mark.slow
-def test_track_drifts_without_subpixel_matching() -> None:
-    # Each of 32 steps adds an error of up to half a pixel (0.4 px rms), which later steps magnify: about 6 px in total.
-    drifts = []
-    for seed in (0, 3):
-        target = np.array([10.0, 0.0, 0.2])
-        drive = Drive(
-            make_scene(make_face(seed, target), target, seed),
-            navcam(),
-            VisualTargetTracker(replace(SMALL_WINDOW, subpixel=False, min_match_score=0.0)),
-        )
-        true_pose, last = drive_to_target(drive, target, 0.05)[-1]
-        drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
-    assert max(drifts) > 2.5
+    assert 1.5 < np.sqrt(np.mean(np.square(drifts))) < 10.0
 
 
 # ----- appearance -----
@@ -159,17 +135,6 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
         match = get_details(update).match
         scores[step] = match.score
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
-
-
-def test_driving_backwards_shrinks_the_template() -> None:
-    target = np.array([4.0, 0.1, 0.2])
-    drive = start_drive(target, 2)
-    for x in (-0.4, -0.8, -1.2):
-        update = drive.stop(pose(x, 0.0))
-        change = get_details(update).change
-        assert update.tracked
-        assert 0.88 < change.magnification < 0.93
-        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
 
 
 # ----- designation, stereo, poses -----
@@ -417,11 +382,7 @@ def test_image_without_the_target_is_reported_as_lost() -> None:
 def test_target_outside_all_images_is_abandoned() -> None:
     target = np.array([6.0, 0.1, 0.2])
     drive = start_drive(target, 3)
-    tracker = drive.tracker
     other_direction = replace(drive.measurements[-1], azimuth_rad=2.0)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    assert [tracker.update(other_direction).state for _ in range(3)] == [
-        TrackingState.LOST,
-        TrackingState.LOST,
-        TrackingState.FAILURE,
-    ]
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    states = [drive.tracker.update(other_direction).state for _ in range(3)]
+    assert states == [TrackingState.LOST, TrackingState.LOST, TrackingState.FAILURE]

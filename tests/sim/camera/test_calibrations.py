@@ -1,6 +1,5 @@
-"""Tests of reading calibration files of OpenCV, ROS, Kalibr and EuRoC, against OpenCV's projection."""
+"""Tests of OpenCV's camera models, and of calibration files of OpenCV, ROS, Kalibr and EuRoC, against OpenCV."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from marsyard.sim.camera import (
     Cahvore,
     CameraFileError,
     CameraModel,
+    from_opencv,
     from_opencv_fisheye,
     read_calibrations,
     read_camera,
@@ -117,14 +117,6 @@ def write_file(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
     return path
 
 
-def write_opencv(storage: cv2.FileStorage, matrix: np.ndarray, distortion: np.ndarray) -> None:
-    for name, value in (("image_width", 800), ("image_height", 600)):
-        storage.write(name, value)
-    storage.write("camera_matrix", matrix)
-    storage.write("distortion_coefficients", distortion)
-    storage.release()
-
-
 def make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
@@ -144,25 +136,6 @@ def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
     # The residual is less than the reprojection error of the calibration, 0.44 px.
     assert 0.0 < calibration.residual.rms_px < 0.2
     assert read_camera(path) == calibration.camera
-
-
-def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "written.yml"
-    matrix, distortion = make_camera_matrix(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0, 0.0])
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    write_opencv(storage, matrix, distortion)
-    (calibration,) = read_calibrations(path)
-    # CAHVOR represents k1 and k2 exactly.
-    assert calibration.residual.max_px < 1e-9
-    assert compute_max_opencv_distance_px(calibration.camera, matrix, [*distortion]) < 1e-6
-
-
-def test_opencv_json_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "written.json"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    write_opencv(storage, make_camera_matrix(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0]))
-    json.loads(path.read_text())
-    assert read_camera(path).focal_lengths == pytest.approx((812.5, 810.25))
 
 
 def test_ros_camera_info_is_read(tmp_path: Path) -> None:
@@ -342,3 +315,37 @@ def test_large_files_are_rejected_without_reading(tmp_path: Path) -> None:
         file.truncate(1 << 30)
     with pytest.raises(CameraFileError, match="larger than 8 MiB"):
         read_cameras(path)
+
+
+OPENCV_MATRIX = np.array([[900.0, 0.0, 630.0], [0.0, 905.0, 350.0], [0.0, 0.0, 1.0]])
+OPENCV_POSE = RigidTransform.from_components([0.5, -1.0, 2.0], Rotation.from_rotvec([0.4, -0.2, 1.0]))
+
+
+@pytest.mark.parametrize("distortion", [[], [-0.2, 0.05, 0, 0], [0.1, -0.02, 0, 0, 0]])
+def test_radial_distortion_from_opencv_is_exact(distortion: list[float]) -> None:
+    coefficients = np.array(distortion, dtype=float)
+    camera, residual = from_opencv(OPENCV_MATRIX, coefficients, (1280, 720), OPENCV_POSE)
+    assert residual.max_px < 1e-9
+    assert compute_max_opencv_distance_px(camera, OPENCV_MATRIX, coefficients, OPENCV_POSE) < 1e-7
+
+
+def test_skew_of_the_matrix_is_preserved() -> None:
+    skewed = OPENCV_MATRIX + np.array([[0, 2.0, 0], [0, 0, 0], [0, 0, 0]])
+    camera, _ = from_opencv(skewed, np.zeros(0), (1280, 720))
+    point = np.array([0.2, -0.1, 1.0])
+    assert np.allclose(camera.project(point)[0], (skewed @ point)[:2], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "distortion", "fault"),
+    [
+        (OPENCV_MATRIX, np.zeros(12), "distortion must be none"),
+        (OPENCV_MATRIX, np.array([np.nan, 0, 0, 0]), "finite"),
+        (-OPENCV_MATRIX, np.zeros(5), "matrix must be"),
+        (OPENCV_MATRIX + np.eye(3), np.zeros(5), "matrix must be"),
+        (OPENCV_MATRIX, np.array([-2.0, 0.0, 0.0, 0.0]), "folds over"),
+    ],
+)
+def test_invalid_opencv_cameras_are_rejected(matrix: np.ndarray, distortion: np.ndarray, fault: str) -> None:
+    with pytest.raises(ValueError, match=fault):
+        from_opencv(matrix, distortion, (1280, 720))

@@ -1,6 +1,5 @@
 """Tests of camera files: PDS3 labels, JPL's CAHVOR text files, round trips and error messages."""
 
-import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -328,21 +327,6 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
         read_camera(write_file(tmp_path, ""))
     with pytest.raises(CameraFileError, match="PDS_VERSION_ID: missing"):
         read_pds3_product(write_file(tmp_path, CMOD_TEXT))
-
-
-@pytest.mark.slow
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.sampled_from([CMOD_TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30)
-)
-def test_damaged_files_raise_file_errors(
-    tmp_path: Path, text: str, position: int, insertion: bytes, removed: int
-) -> None:
-    original = text.encode("latin-1")
-    path = tmp_path / "damaged"
-    path.write_bytes(original[:position] + insertion + original[position + removed :])
-    with contextlib.suppress(CameraFileError):
-        assert len(read_cameras(path)) == 1
 
 
 #: The label with the keywords and group names of a navigation camera of Curiosity (MSL_MMM EDR).

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -68,15 +68,15 @@ def pixels_from_fractions(camera: CameraModel, uv: np.ndarray) -> np.ndarray:
 # ----- projection and rays are inverse -----
 
 
-@pytest.mark.parametrize("distance_m", [0.5, 10.0, 1e4])
-def test_projection_inverts_rays_of_real_cameras(camera: CameraModel, distance_m: float) -> None:
-    pixels = camera.pixel_grid()
+def test_projection_inverts_rays_of_real_cameras(camera: CameraModel) -> None:
+    pixels = camera.pixel_grid()[::3, ::3]
     origins, directions = camera.rays(pixels)
-    reprojected, visible = camera.project(origins + distance_m * directions)
-    assert visible.all()
-    # The requirement is 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton's method converges to rounding errors: about
-    # 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px for pixels near 1000 and points near 1e4 m.
-    assert np.max(np.abs(reprojected - pixels)) < 1e-10
+    for distance_m in (0.5, 10.0, 1e4):
+        reprojected, visible = camera.project(origins + distance_m * directions)
+        assert visible.all()
+        # The requirement is 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton's method converges to rounding errors:
+        # about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px for pixels near 1000 and points near 1e4 m.
+        assert np.max(np.abs(reprojected - pixels)) < 1e-10
 
 
 @given(cameras, fractions, st.floats(0.5, 1e5))
@@ -157,6 +157,7 @@ def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float
     return beta / alpha, gamma / alpha
 
 
+@settings(max_examples=50)
 @given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
 def test_projection_matches_cmod(camera: Cahvor | Cahvore, uv: np.ndarray, distance_m: float) -> None:
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
@@ -267,17 +268,18 @@ def test_jacobian_of_random_cameras_matches_differences(camera: CameraModel, uv:
 # ----- shapes -----
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,), (4, 0)])
-def test_leading_dimensions_are_preserved(camera: CameraModel, shape: tuple[int, ...]) -> None:
-    points = np.broadcast_to(camera.c + 3 * camera.a, (*shape, 3))
-    pixels, visible = camera.project(points)
-    assert pixels.shape == (*shape, 2)
-    assert visible.shape == shape
-    assert isinstance(visible, np.ndarray)
-    assert camera.in_frame(pixels).shape == shape
-    origins, directions = camera.rays(pixels)
-    assert origins.shape == directions.shape == (*shape, 3)
-    assert camera.projection_jacobian(points).shape == (*shape, 2, 3)
+def test_leading_dimensions_are_preserved(camera: CameraModel) -> None:
+    shapes: list[tuple[int, ...]] = [(), (1,), (5,), (2, 3), (0,), (4, 0)]
+    for shape in shapes:
+        points = np.broadcast_to(camera.c + 3 * camera.a, (*shape, 3))
+        pixels, visible = camera.project(points)
+        assert pixels.shape == (*shape, 2)
+        assert visible.shape == shape
+        assert isinstance(visible, np.ndarray)
+        assert camera.in_frame(pixels).shape == shape
+        origins, directions = camera.rays(pixels)
+        assert origins.shape == directions.shape == (*shape, 3)
+        assert camera.projection_jacobian(points).shape == (*shape, 2, 3)
 
 
 def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
@@ -289,22 +291,18 @@ def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
         assert np.array_equal(camera.project(points[index])[0], all_pixels[index])
 
 
-def test_arguments_are_not_modified(camera: CameraModel) -> None:
+def test_arguments_are_not_modified_and_may_have_single_precision(camera: CameraModel) -> None:
     points = camera.c + np.array([[3.0, 0.1, 0.2], [-3.0, 0.1, 0.2]])
     pixels = np.array([[3.0, 4.0], [500.0, 600.0]])
-    points_before, pixels_before = points.copy(), pixels.copy()
+    # a change would raise an exception
+    points.flags.writeable = pixels.flags.writeable = False
     camera.project(points)
     camera.projection_jacobian(points)
     camera.rays(pixels)
-    assert np.array_equal(points, points_before)
-    assert np.array_equal(pixels, pixels_before)
-
-
-def test_single_precision_points_are_accepted(navcam: Cahvor) -> None:
-    points = (navcam.c + 3 * navcam.a)[np.newaxis].astype(np.float32)
-    pixels = navcam.project(points)[0]
-    assert pixels.dtype == np.float64
-    assert np.allclose(pixels, navcam.project(points.astype(float))[0], rtol=0, atol=1e-9)
+    single = points.astype(np.float32)
+    result = camera.project(single)[0]
+    assert result.dtype == np.float64
+    assert np.allclose(result, camera.project(single.astype(float))[0], rtol=0, atol=1e-9, equal_nan=True)
 
 
 def test_frame_reaches_half_a_pixel_beyond_the_centres(navcam: Cahvor) -> None:

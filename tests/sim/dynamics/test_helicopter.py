@@ -48,24 +48,9 @@ def test_heights_speed_and_tilt_match_the_paper() -> None:
     assert 25.0 < np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max() < 61.0
 
 
-@pytest.mark.slow
-def test_rates_of_climb_are_uniform() -> None:
-    """Between 1 and 2 m/s: mean 1.5, standard deviation 1 / sqrt(12). Tolerances: four standard errors of 400 passes.
-
-    The maximum height does not select the rates of the first five passes: they climb by at most 5 x 70 s x 2 m/s, or
-    700 m.
-    """
-    rates = np.array([leg.climb_m_s for seed in range(80) for leg in draw_default_flight(seed).passes[:5]])
-    assert rates.min() >= 1.0
-    assert rates.max() <= 2.0
-    assert rates.mean() == pytest.approx(1.5, abs=4.0 * np.sqrt(1.0 / 12.0 / 400))
-    # the variance of the variance of a uniform distribution of width 1 is 1/180 for each sample
-    assert rates.var() == pytest.approx(1.0 / 12.0, abs=4.0 * np.sqrt(1.0 / 180.0 / 400))
-
-
 def test_run_ends_at_the_maximum_height() -> None:
     """Paper, III.C and III.D.4: from 1000 m to 2000 m, images for about 30 min, about 40 min between the targets."""
-    for seed in range(20):
+    for seed in range(6):
         passes = draw_default_flight(seed).passes
         assert passes[0].start_m == 1000.0
         for before, after in pairwise(passes):

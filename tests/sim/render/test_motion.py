@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -53,8 +52,8 @@ def test_descent_image_motion_matches_the_camera(renderer: Renderer, terrain: Su
         assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * MAX_MEAN_ERROR_PX
 
 
-@pytest.mark.parametrize("distance_m", [5.0, 2.0])
-def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_m: float) -> None:
+def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer) -> None:
+    distance_m = 2.0
     parameters = TerrainParameters(
         samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
     )

@@ -1,7 +1,5 @@
 """Tests of `Objects` (triangle meshes of several bodies), of the ground mesh, and of shadow footprints."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, site_scene
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, PixelRays, Renderer, Scene, Sun, process_renderer
@@ -21,7 +19,7 @@ from marsyard.sim.render.pinhole import depth_in_metres
 from marsyard.sim.render.shadows import Footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, Surface, TerrainParameters, site
-from tests.sim.scenes import LAMBERT, make_ground
+from tests.sim.scenes import LAMBERT, make_ground, mesh_body
 
 #: Number of triangles of each body.
 COUNTS = (5, 1, 80, 3)
@@ -177,24 +175,7 @@ def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     assert Footprint.of(sphere, direction(0.0, -0.1), 0.0) is None
 
 
-def test_footprint_does_not_change_images() -> None:
-    """The images of ground with many rocks under a low sun are bitwise equal."""
-    ground = SiteGround.from_site(site("gusev").model_copy(update={"descent": ROCKY}))
-    rays = PixelRays.from_camera(preset("mer-descent-flown").cameras()[0].bin(4, 4))
-    pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
-    scene = site_scene(ground, Viewpoint.from_pose(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
-    assert len(scene.objects) > 50
-    frame = process_renderer(default_backend()).render(scene, rays, pose)
-    # Replace the cached property: no pixel is excluded from the shadow test.
-    full_scene = replace(scene)
-    full_scene.__dict__["footprint"] = None
-    full_frame = process_renderer(default_backend()).render(full_scene, rays, pose)
-    np.testing.assert_array_equal(frame.radiance, full_frame.radiance)
-    assert not to_host(scene.footprint.cells).all()
-
-
-@pytest.mark.parametrize("elevation", [0.25, 1.0])
-def test_culling_does_not_change_images(elevation: float) -> None:
+def test_culling_does_not_change_images() -> None:
     """A mast subframe among rocks is equal with and without culling, for two sun elevations and azimuths.
 
     A ray that meets the common edge of two triangles can hit either: the surface of its rock differs by rounding there.
@@ -205,9 +186,9 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     ground = SiteGround.from_site(
         site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})})
     )
-    rays = PixelRays.from_camera(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
+    rays = PixelRays.from_camera(preset("research-navcam").cameras()[0].crop(420, 400, (121, 121)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
-    for azimuth in (0.5, 3.0):
+    for azimuth, elevation in ((0.5, 1.0), (3.0, 0.25)):
         viewpoint = Viewpoint(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, max_distance_m=25.0)
         scene = site_scene(ground, viewpoint, Sun(direction(azimuth, elevation)))
         visible_scene = scene.restrict_to_cones([rays.cone(pose)])
@@ -228,12 +209,8 @@ def test_no_part_of_a_body_below_the_ground_is_visible(renderer: Renderer) -> No
     surface = make_ground(np.broadcast_to(ripples, (256, 256)), 0.05)
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.6)
     sphere.apply_translation([6.4, 6.4, -0.35])
-    faces = sphere.faces.astype(np.int32)
-    names = np.zeros(len(faces), dtype=np.int32)
-    body = Objects.of_mesh(np.array(sphere.vertices), np.array(sphere.vertex_normals), faces, names, albedo=0.2)
-    scene = Scene(
-        surface, (6.4, 6.4), Sun(direction(0.5, 0.8)), LAMBERT, body, mesh_finest_m=0.3, mesh_half_width_m=100.0
-    )
+    sun, body = Sun(direction(0.5, 0.8)), mesh_body(sphere)
+    scene = Scene(surface, (6.4, 6.4), sun, LAMBERT, body, mesh_finest_m=0.3, mesh_half_width_m=100.0)
     camera = Cahv.from_field_of_view(np.radians(25.0), (256, 256), axis=(1.0, 0.0, -0.35), right=(0.0, -1.0, 0.0))
     frame = renderer.render(scene, PixelRays.from_camera(camera), rigid(Rotation.identity(), np.array([3.0, 6.4, 1.2])))
     x, y, z = frame.points_world()[frame.body >= 0].T

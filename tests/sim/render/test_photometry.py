@@ -35,25 +35,10 @@ def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
     assert law.normalisation() * np.mean(surge * disc / cos_i) == pytest.approx(1.0, rel=0.01)
 
 
-def _make_fisheye_camera() -> Cahvore:
-    pinhole = Cahv.from_focal_length(5.58e-3, 24e-6, (512, 512), **DOWN)
-    return Cahvore.from_cahv(pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006), linearity=-0.1)
-
-
-@pytest.mark.parametrize("is_fisheye", [False, True])
-def test_opposition_peak_is_at_the_antisolar_point(renderer: Renderer, is_fisheye: bool) -> None:
-    """The centroid of the peak is within half a pixel of the antisolar point."""
-    camera = _make_fisheye_camera() if is_fisheye else descent_camera(512)
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
-    pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
-    for antisolar_pixel in np.array([[150.3, 201.8], [330.6, 255.1]]):
-        _, ray = camera.transform(pose).rays(antisolar_pixel)
-        frame = renderer.render(Scene(FLAT, (0.0, 0.0), Sun(-ray), law), PixelRays.from_camera(camera), pose)
-        radiance = frame.radiance.astype(np.float64)
-        weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
-        v, u = np.mgrid[:512, :512]
-        peak = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
-        assert np.linalg.norm(peak - antisolar_pixel) < 0.5
+FISHEYE = Cahvore.from_cahv(
+    Cahv.from_focal_length(5.58e-3, 150e-6, (64, 64), **DOWN), r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006),
+    linearity=-0.1,
+)  # fmt: skip
 
 
 #: Pose of a camera 1 km above the origin that looks down.
@@ -70,9 +55,10 @@ def _render_ground(
     return np.asarray(renderer.render(scene, PixelRays.from_camera(camera), pose).radiance)
 
 
-def test_lunar_lambert_matches_the_formula(renderer: Renderer) -> None:
-    camera = descent_camera(64)
-    sun = Sun(direction(np.radians(200.0), np.radians(50.0)))
+@pytest.mark.parametrize("camera", [descent_camera(64), FISHEYE])
+def test_lunar_lambert_matches_the_formula(renderer: Renderer, camera: CameraModel) -> None:
+    """The image contains the antisolar point, where the opposition surge has its peak."""
+    sun = Sun(direction(np.radians(200.0), np.radians(75.0)))
     law = Photometry(
         lunar_fraction=0.6, surge_amplitude=0.8, surge_width=0.05, sky_fraction=0.2, surrounding_albedo=0.0
     )

@@ -15,13 +15,7 @@ from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.casters import are_occluded, casters_towards
 from marsyard.sim.render.cones import Bounds, ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool, UInt32
-from marsyard.sim.render.ground_shadow import (
-    GroundShadow,
-    compute_ground_shadow,
-    is_sun_above_slopes,
-    periodic_window,
-    slope_bounds,
-)
+from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from tests.sim.scenes import DOWN, LAMBERT, NEAR_MESH, descent_camera, level_plate, look_down, make_ground, rocks_near
@@ -213,14 +207,6 @@ def test_shadow_needs_a_level_with_few_enough_samples(terrain: Surface, monkeypa
         compute_ground_shadow(terrain, sun, (0.0, 1.0))
 
 
-@pytest.mark.parametrize(("start", "selected"), [(0, [0, 1, 2, 3]), (6, [0, 1, 6, 7]), (-3, [0, 5, 6, 7])])
-def test_periodic_window_keeps_coordinates_modulo_its_period(start: int, selected: list[int]) -> None:
-    """Four of eight samples, also across the ends of the axis."""
-    window = periodic_window(start, 4, 8)
-    assert sorted(window) == selected
-    np.testing.assert_array_equal(window % 4, np.arange(4))
-
-
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])
 def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_deg: float) -> None:
     def sun_at(elevation_rad: float) -> Sun:
@@ -252,10 +238,6 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert scene.shadow is None
     below = scene.with_light(just_below, Photometry())
     assert below.shadow is not None
-    # the number of rays at edges changes no cached result
-    assert below.with_edge_rays(1).edge_rays == 1
-    assert below.with_edge_rays(1).shadow is below.shadow
-    assert below.edge_rays == 2
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -23,7 +23,7 @@ from marsyard.sim.render.shadows import AUREOLE_BEHIND_BODY
 from marsyard.sim.render.sky import AUREOLE_RADIUS_RAD, SkyLight
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.terrain import Environment
-from tests.sim.scenes import DOWN, LAMBERT, flat_ground, make_ground
+from tests.sim.scenes import DOWN, LAMBERT, flat_ground, make_ground, mesh_body
 
 SUN = Sun(direction(0.4, np.radians(40.0)))
 
@@ -158,10 +158,7 @@ def test_thin_body_hides_the_disc_of_the_sun_only(renderer: Renderer, depth: flo
     photometry = Photometry(0.0, 0.0, sky_fraction=sky_fraction, surrounding_albedo=0.0, sky=sky)
     pole = trimesh.creation.box((0.02, 0.02, 4.0))
     pole.apply_translation([6.4, 6.4, 2.0])
-    faces = pole.faces.astype(np.int32)
-    # a part of a rover, not a body on the ground
-    names = np.full(len(faces), -1, dtype=np.int32)
-    objects = Objects.of_mesh(np.array(pole.vertices), np.array(pole.vertex_normals), faces, names, albedo=0.2)
+    objects = mesh_body(pole, -1)  # a part of a rover, not a body on the ground
     scene = Scene(
         flat_ground(256, 0.05),
         (6.4, 6.4),
@@ -188,9 +185,7 @@ def test_rock_outside_of_the_image_hides_its_sky_also_next_to_a_rover(renderer: 
     rover = rover_objects(MER, settle(MER, flat_ground(64, 0.2), middle, middle, 0.0), MER_MAST, 0.0, 0.0)
     rock = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
     rock.apply_translation([middle + 2.35, middle, 0.0])
-    faces = rock.faces.astype(np.int32)
-    names = np.zeros(len(faces), dtype=np.int32)
-    objects = Objects.of_mesh(np.array(rock.vertices), np.array(rock.vertex_normals), faces, names, albedo=0.2)
+    objects = mesh_body(rock)
     photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.45, sky=DustySky(0.9, 0.94, 0.65))
     # the shadows of rock and rover fall to the east, the image is north-west of the rock's centre
     sun = Sun(direction(1.5 * np.pi, np.radians(60.0)))

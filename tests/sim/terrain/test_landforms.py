@@ -1,8 +1,5 @@
 """Tests of landforms: their specified shapes, and independence of each other."""
 
-import os
-import subprocess
-import sys
 from typing import Literal
 
 import numpy as np
@@ -65,25 +62,6 @@ def test_added_landform_does_not_change_others(name: str) -> None:
     with_landform = rough_parameters.model_copy(update={name: LANDFORMS[name]})
     difference = synthesise_heights(with_landform) - synthesise_heights(rough_parameters)
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
-    program = (
-        "import hashlib, numpy as np\n"
-        "from marsyard.sim.terrain import TerrainParameters, synthesise\n"
-        "from marsyard.sim.terrain.landforms import *\n"
-        "p = TerrainParameters(samples=256, dunes=Dunes(), lava=Lava(), swell=Swell(), playa=Playa())\n"
-        "print(hashlib.sha256(synthesise(p, np.random.default_rng(5)).levels[0].tobytes()).hexdigest())\n"
-    )
-    hashes = set()
-    for threads in ("1", "4"):
-        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-        environment = {**os.environ, **dict.fromkeys(names, threads)}
-        command = [sys.executable, "-c", program]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        hashes.add(run.stdout.strip())
-    assert len(hashes) == 1
 
 
 def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:

@@ -1,7 +1,5 @@
 """Tests of rock shapes, size distribution, placement and level of detail."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -11,7 +9,6 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
-from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.field import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.kernels import place_discs
 from marsyard.sim.terrain.rocks.shapes import (
@@ -293,30 +290,10 @@ def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
     assert empty_mesh.faces.shape == empty_mesh.vertices.shape == (0, 3)
 
 
-@pytest.mark.slow
-def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
-    cache_clears = [
-        function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._compute_max_radius)
-    ]
-    results = []
-    for _ in range(2):
-        for clear_cache in cache_clears:
-            clear_cache()
-        coarse = rock_shapes(COARSE)
-        results.append([coarse.vertices, coarse.normals, coarse.max_radius, max_pixels()])
-        files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
-    # The files contain vertices of five levels, normals of two levels, and the sizes in pixels.
-    assert len(files) == 8
-    for first, second in zip(*results, strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert not any(array.flags.writeable for array in results[1][:2])
-
-
 def _edge_radii(number: int) -> Float64[np.ndarray, "n"]:
     """Radii of curvature along a circle around a shape's vertical at 45 deg, in radii of the rock."""
     shape = _all_shapes()[number]
-    azimuth = np.radians(np.arange(0.0, 360.0, 0.05))
+    azimuth = np.radians(np.arange(0.0, 360.0, 0.1))
     directions = np.sqrt(0.5) * np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(azimuth.size)], axis=1)
     points = shape.to_unit_shape(directions * shape.radius(directions)[:, None])
     normals = shape.normals(directions)
