@@ -156,6 +156,7 @@ class CaseFinder:
         has_numbers = "case" in self._frame
         #: Numbers of the cases that violate any requirement, in increasing order; empty for rows without numbers.
         self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if has_numbers else []
+        self._thumbnails: dict[int, str] = {}
 
     def requirement_cases(self) -> list[RequirementCases]:
         """List the cases of each requirement."""
@@ -238,9 +239,10 @@ class CaseFinder:
         unusual = self._unusual_driver(row)
         parts = [self._describe_error(item, values, violates), "" if cause is None else cause.detail, unusual]
         sentence = "; ".join(part for part in parts if part)
-        image = thumbnail(self._run.products(case)) if case in self._run.stored_cases else ""
+        if case in self._run.stored_cases and case not in self._thumbnails:
+            self._thumbnails[case] = thumbnail(self._run.products(case))
         return ListedCase(
-            case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", image
+            case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", self._thumbnails.get(case, "")
         )
 
     def _row(self, row: int) -> dict[str, Any]:
