@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.parameter_paths import leaves
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
-from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.images import thumbnail
+from marsyard.reports.populations import compute_margins
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun, table
@@ -239,11 +239,11 @@ class CaseFinder:
         unusual = self._unusual_driver(row)
         parts = [self._describe_error(item, values, violates), "" if cause is None else cause.detail, unusual]
         sentence = "; ".join(part for part in parts if part)
+        sentence = f"{sentence[:1].upper()}{sentence[1:]}."
         if case in self._run.stored_cases and case not in self._thumbnails:
             self._thumbnails[case] = thumbnail(self._run.products(case))
-        return ListedCase(
-            case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", self._thumbnails.get(case, "")
-        )
+        outcome = str(values.get("outcome", NOTHING))
+        return ListedCase(case, violates, outcome, sentence, self._thumbnails.get(case, ""))
 
     def _row(self, row: int) -> dict[str, Any]:
         return {str(name): value for name, value in self._frame.iloc[row].items()}

@@ -19,8 +19,7 @@ from marsyard.cli.terminal import grid_table
 from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
-from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.looks import record_look
+from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
 from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.robustness_wording import robustness_text

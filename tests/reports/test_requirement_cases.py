@@ -13,7 +13,6 @@ import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
-from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
@@ -22,6 +21,7 @@ from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.images import thumbnail
 from marsyard.reports.localisation.presentation import LOCALISATION
+from marsyard.reports.populations import compute_margins
 from marsyard.reports.presentation import Cause, Presentation
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
 from marsyard.reports.vtt.presentation import VTT
