@@ -1,7 +1,6 @@
 """Tests of optional report sections with rows of known statistics."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,14 @@ from marsyard.reports.conditions import bin_conditions, conditions_section, terr
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.influences import drivers_section
 from marsyard.reports.section import Section, Subject
-from marsyard.reports.stored import StoredRun
+from tests.reports import synthetic_run
 from tests.reports.synthetic_run import MakeRun, make_rows
 
 METRIC = "velocity_error_m_s"
 
 
 def make_subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
-    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), METRIC, bound)
+    return synthetic_run.make_subject(frame, METRIC, bound)
 
 
 def find_cells(section: Section | None, row: str) -> list[str]:
@@ -161,8 +160,7 @@ def test_false_fixes_are_wrong_answers_whatever_is_reported_later() -> None:
     # three crashed cases, without flags
     crashed = pd.DataFrame({"fault": ["haze"] * 3, "fault_size": 1.0, "answered": False, "outcome": "CRASHED"})
     frame = pd.concat([frame, crashed], ignore_index=True)
-    run = StoredRun(Path("run"), frame, frame, {"scenario": "localisation"}, ())
-    subject = Subject(run, "position_error_at_10_s_m", 40.0)
+    subject = synthetic_run.make_subject(frame, "position_error_at_10_s_m", 40.0, scenario="localisation")
     name, wrong = list(answer_fractions(subject).items())[-1]
     assert name.startswith("wrong answers: a reported position is more than 40 m from the true one (of cases")
     assert (wrong.hits, wrong.n) == (50, 100)
@@ -269,17 +267,18 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     assert landing_section(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_page_and_json_contain_every_section(make_run: MakeRun) -> None:
     rng = np.random.default_rng(4)
-    frame = make_rows(120).assign(
+    frame = make_rows(80).assign(
         feasible_overlap=True,
-        descent_rate_m_s=rng.normal(75.0, 3.0, 120),
-        fault=["dust", "cable noise"] * 60,
-        fault_size=[0.1, 0.1, 0.2, 0.2] * 30,
-        touchdown_speed_corrected_m_s=rng.uniform(0.0, 10.0, 120),
-        touchdown_speed_uncorrected_m_s=rng.uniform(0.0, 30.0, 120),
+        descent_rate_m_s=rng.normal(75.0, 3.0, 80),
+        fault=["dust", "cable noise"] * 40,
+        fault_size=[0.1, 0.1, 0.2, 0.2] * 20,
+        touchdown_speed_corrected_m_s=rng.uniform(0.0, 10.0, 80),
+        touchdown_speed_uncorrected_m_s=rng.uniform(0.0, 30.0, 80),
     )
-    directory = make_run(frame)
+    directory = make_run(frame.drop(columns=["sun_elevation_deg", "horizontal_speed_m_s", "off_nadir_max_deg"]))
     text = write_report(directory).read_text(encoding="utf-8")
     report: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     keys = ["robustness", "answers", "scatter", "explained", "convergence", "faults", "validity", "landing"]
