@@ -4,7 +4,6 @@ The files are signed with the user's key, if there is one (`marsyard.reports.rep
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -41,6 +40,7 @@ from marsyard.reports.stored import table
 from marsyard.reports.tables import error_summaries
 from marsyard.reports.validity import validity_section
 from marsyard.reports.verdict_files import junit_xml, requirement_evidence, verification_csv
+from marsyard.reports.verdicts import find_bound
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -118,8 +118,7 @@ def create_subject(evaluation: Evaluation) -> Subject:
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
     # the cases of a study are not a random sample; statistics of their errors would be meaningless
     metric = None if run.recorded("study") else primary_metric(random_run.frame, run.requirements)
-    bounds = (item.bound / item.scale for item in evaluation.verdicts if item.metric == metric)
-    return Subject(random_run, metric, next((bound for bound in bounds if math.isfinite(bound)), None))
+    return Subject(random_run, metric, find_bound(evaluation.verdicts, metric))
 
 
 def section_makers() -> list[SectionMaker]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.claims import hash_requirements
+from marsyard.campaigns.definition.claims import Confirmation, hash_requirements
 from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmation_record import locate_record
 from marsyard.campaigns.store.confirmations import add_result
@@ -58,6 +58,7 @@ class Evaluation:
       allows no PASS
     - verdicts: verdict of each requirement; empty for a study
     - is_qualified: whether a met requirement needs a decision of a person (`marsyard.reports.joint`)
+    - own: entry of the run in the record of confirmations; None without one
     """
 
     run: StoredRun
@@ -66,6 +67,7 @@ class Evaluation:
     verdicts: Sequence[Verdict]
     overall_verdict: OverallVerdict
     is_qualified: bool = False
+    own: Confirmation | None = None
 
     @cached_property
     def validity(self) -> Validity:
@@ -140,7 +142,7 @@ def evaluate_run(
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
     is_qualified = joint.is_confirmation and any(joint.is_qualified(verdict.requirement_id) for verdict in verdicts)
     is_qualified = is_qualified or bool(verdicts and run.unverified)
-    return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified)
+    return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified, joint.own)
 
 
 def _mark_unverified(verdict: Verdict, run: StoredRun) -> Verdict:
@@ -253,10 +255,9 @@ def record_look(evaluation: Evaluation) -> None:
     evidence, run = evaluation.evidence, evaluation.run
     if evidence.kind is not EvidenceKind.CONFIRMATION:
         return
-    own = read_joint_evidence(evidence).own
-    if own is None:  # stated in the verdict
+    if evaluation.own is None:  # stated in the verdict
         return
-    counts = collect_counts(run, own, evaluation.sampling.with_open_end)
+    counts = collect_counts(run, evaluation.own, evaluation.sampling.with_open_end)
     results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
     add_result(evidence, len(run.all_cases), results, counts)
 

@@ -63,7 +63,8 @@ def _page_style(**changes: str) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # without the checks of `mpl.style.context`, which would take longer than many a figure
-        dict.update(mpl.rcParams, {**_style_values(), **changes})
+        settings: Any = mpl.rcParams
+        dict.update(settings, {**_style_values(), **changes})
         yield
 
 

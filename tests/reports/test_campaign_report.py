@@ -242,7 +242,9 @@ def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun) 
     frame = make_rows(24).assign(velocity_error_m_s=np.where(np.arange(24) < 6, 0.05, 0.01), answered=True)
     requirement = {"id": "SCALED", "metric": "velocity_error_m_s", "bound": 2.0, "scale": 60.0}
     directory = make_run(frame=frame, requirements=[requirement | {"probability": 0.9, "confidence": 0.9}])
-    answers = answer_fractions(create_subject(evaluate_run(directory)))
+    subject = create_subject(evaluate_run(directory))
+    assert subject.bound == pytest.approx(2.0 / 60.0)
+    answers = answer_fractions(subject)
     wrong_answers = next(fraction for name, fraction in answers.items() if name.startswith("wrong"))
     assert (wrong_answers.hits, wrong_answers.n) == (6, 24)
 
