@@ -22,9 +22,9 @@ from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.consistency import consistency_section
 from marsyard.reports.convergence import convergence_section
+from marsyard.reports.effects import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.failure_boundary import boundary_section
-from marsyard.reports.influences import drivers_section
 from marsyard.reports.page import page_context
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.populations import outcome_counts

@@ -12,7 +12,7 @@ from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
-from marsyard.reports.influences import drivers_section
+from marsyard.reports.effects import drivers_section
 from marsyard.reports.section import Section, Subject
 from tests.reports import synthetic_run
 from tests.reports.synthetic_run import MakeRun, make_rows
