@@ -148,6 +148,7 @@ def test_small_report_contains_the_main_results(make_run: MakeRun, dimes_product
     assert len(text) < 2_000_000
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_requirement_met_by_rate_has_its_own_symbol(make_run: MakeRun) -> None:
     requirement = {**VELOCITY, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
     directory = make_run(make_rows(24)[MIN_COLUMNS], [requirement])
@@ -200,6 +201,7 @@ def test_texts_from_files_are_escaped(make_run: MakeRun, dimes_products: dict[st
         '{"name": "\\ud800", "seed": [1], "description": {"a": "b"}}',
     ],
 )
+@pytest.mark.usefixtures("plain_figures")
 def test_damaged_record_gives_a_valid_page(make_run: MakeRun, record: str) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     (directory / "campaign.json").write_text(record, encoding="utf-8")
@@ -207,6 +209,7 @@ def test_damaged_record_gives_a_valid_page(make_run: MakeRun, record: str) -> No
     _check_page(text, page)
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_missing_record_and_damaged_products_give_a_valid_page(make_run: MakeRun) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS], products={"image_1": np.zeros((4, 4))})
     (directory / "campaign.json").unlink()
@@ -216,6 +219,7 @@ def test_missing_record_and_damaged_products_give_a_valid_page(make_run: MakeRun
     _check_page(text, page)
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_interrupted_campaign_is_marked(make_run: MakeRun) -> None:
     text, _, report = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
     assert "Not finished." in text

@@ -198,7 +198,7 @@ def test_other_campaigns_have_no_section(section: Any) -> None:
 
 @pytest.mark.usefixtures("plain_figures")
 def test_page_and_json_have_the_sections(make_run: Callable[..., Path], products: dict[str, Any]) -> None:
-    directory = make_run(localisation_frame(40), [REQUIREMENT], products=products)
+    directory = make_run(localisation_frame(20), [REQUIREMENT], products=products)
     page = write_report(directory).read_text(encoding="utf-8")
     report = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     assert {"localisation", "localisation-conditions", "consistency"} <= set(report["sections"])
