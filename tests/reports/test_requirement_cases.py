@@ -58,6 +58,14 @@ def _make_finder(make_run: MakeRun, frame: pd.DataFrame, *requirements: Mapping[
     return CaseFinder(evaluation.run, evaluation.verdicts)
 
 
+def test_stored_cases_have_a_preview_in_each_list(make_run: MakeRun, dimes_products: dict[str, Any]) -> None:
+    frame = make_rows(6, answer_rate=0.0)
+    evaluation = evaluate_run(make_run(frame, [AVAILABLE, {**AVAILABLE, "id": "B"}], products=dimes_products))
+    for entry in CaseFinder(evaluation.run, evaluation.verdicts).requirement_cases():
+        previews = {listed.case: listed.thumbnail for listed in entry.violations}
+        assert previews == dict.fromkeys(range(6), "") | {3: thumbnail(dimes_products)}
+
+
 def test_rows_without_numbers_have_no_listed_violations(make_run: MakeRun) -> None:
     finder = _make_finder(make_run, make_rows(30, answer_rate=0.5).drop(columns="case"), AVAILABLE)
     assert finder.violating_cases == finder.worst_violations(2) == finder.violations("A") == []

@@ -11,11 +11,13 @@ from marsyard.reports.campaign_report import write_report
 from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
+from marsyard.reports.convergence import success_rate_curves
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.effects import drivers_section
 from marsyard.reports.section import Section, Subject
 from tests.reports import synthetic_run
-from tests.reports.synthetic_run import MakeRun, make_rows
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 METRIC = "velocity_error_m_s"
 
@@ -265,6 +267,19 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
     assert find_cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
     assert landing_section(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
+
+
+def test_convergence_is_that_of_the_first_cases() -> None:
+    """The first half of the cases violates the requirement, the other half does not."""
+    frame = make_rows(64, answer_rate=1.0, terrains=10_000)
+    frame[METRIC] = np.where(np.arange(64) < 32, 9.0, 1.0)
+    requirement = {**VELOCITY, "population": "all"}
+    (curve,) = success_rate_curves(synthetic_run.make_subject(frame, METRIC, 5.0, requirements=[requirement]))
+    sizes = [point.cases for point in curve.points]
+    assert (sizes[0], sizes[-1], curve.required) == (8, 64, VELOCITY["probability"])
+    assert [point.estimate for point in curve.points] == pytest.approx([max(0, n - 32) / n for n in sizes])
+    (verdict,) = evaluate_requirements(frame, [requirement])
+    assert (curve.points[-1].lower, curve.points[-1].upper) == (verdict.lower, verdict.upper)
 
 
 @pytest.mark.usefixtures("plain_figures")
