@@ -10,6 +10,8 @@ from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import read_report
 from tests.reports.synthetic_run import MIN_COLUMNS, MakeRun, make_rows
 
+pytestmark = pytest.mark.usefixtures("plain_figures")
+
 
 @pytest.mark.parametrize(
     "options",
@@ -22,7 +24,6 @@ from tests.reports.synthetic_run import MIN_COLUMNS, MakeRun, make_rows
         {"cases": 0},
     ],
 )
-@pytest.mark.usefixtures("plain_figures")
 def test_report_is_read_as_written(make_run: MakeRun, options: dict[str, Any]) -> None:
     rows = make_rows(**options | {"cases": max(1, options["cases"])}).head(options["cases"])
     directory = make_run(rows[[*MIN_COLUMNS, "terrain"]])
@@ -36,7 +37,6 @@ def test_report_is_read_as_written(make_run: MakeRun, options: dict[str, Any]) -
 
 
 @pytest.mark.parametrize(("key", "value"), [("schema", 6), ("verdicts", [{"n": 1}]), ("cases", "many")])
-@pytest.mark.usefixtures("plain_figures")
 def test_other_layouts_are_not_read(make_run: MakeRun, key: str, value: object) -> None:
     directory = make_run(make_rows(4)[MIN_COLUMNS])
     write_report(directory)

@@ -14,6 +14,7 @@ from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.verdict_files import COLUMNS, junit_xml, requirement_evidence, verification_csv
 from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, make_rows
 
+pytestmark = pytest.mark.usefixtures("plain_figures")
 #: Text that a spreadsheet would evaluate and XML cannot contain.
 HOSTILE = '=HYPERLINK("x")\x00<&>'
 
@@ -62,7 +63,6 @@ def test_junit_lists_failures_and_undecided_requirements() -> None:
     assert _read_message(completion_case, "failure") == "2 cases crashed"
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_junit_skips_the_completion_of_an_unfinished_campaign(make_run: Callable[..., Path]) -> None:
     directory = make_run(make_rows(8)[MIN_COLUMNS], [], state="interrupted")
     write_report(directory)
@@ -77,7 +77,6 @@ def test_junit_states_that_no_case_gives_no_lower_bound() -> None:
     assert "0 of 0 failed; no lower bound, required 0.99" in _read_message(suite[0], "skipped")
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_report_writes_matrix_and_junit_files(make_run: Callable[..., Path]) -> None:
     directory = make_run(make_rows(8)[MIN_COLUMNS])
     write_report(directory)

@@ -24,6 +24,7 @@ from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.verdicts import Status, Verdict
 from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, MakeRun, make_rows, write_table_with_seal
 
+pytestmark = pytest.mark.usefixtures("plain_figures")
 #: Text that would run a script or leave the folder of the site if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'../../{{ 7*7 }}"
 
@@ -33,7 +34,6 @@ def _write_index(tmp_path: Path) -> str:
     return (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_index_lists_all_requirements_and_campaigns(make_run: MakeRun, tmp_path: Path) -> None:
     for day in (1, 2, 3):
         make_run(make_rows(8, seed=day)[MIN_COLUMNS], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
@@ -54,7 +54,6 @@ def test_index_lists_all_requirements_and_campaigns(make_run: MakeRun, tmp_path:
     assert (verdicts["DIMES-VEL"], verdicts["HDA-POS"]) == ("INSUFFICIENT", "NO CAMPAIGN")
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path: Path) -> None:
     paths = []
     for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
@@ -72,7 +71,6 @@ def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path
     assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_confirmations_precede_later_explorations(make_run: MakeRun, tmp_path: Path) -> None:
     """A FAIL of a confirmation is the headline also after explorations with PASS, which are marked everywhere."""
     requirement = {**VELOCITY, "population": "all", "probability": 0.8}
@@ -120,7 +118,7 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
     def fail(*_: Any, **__: Any) -> None:
         raise AssertionError("evaluated or drawn again")
 
-    for name in ("marsyard.reports.dashboard.entries.evaluate_run", "matplotlib.figure.Figure.savefig"):
+    for name in ("marsyard.reports.dashboard.entries.evaluate_run", "marsyard.reports.section.svg_markup"):
         monkeypatch.setattr(name, fail)
     monkeypatch.setattr(CaseFinder, "__init__", fail)
     assert write_site(tmp_path / "site", [directory]).campaigns == 1
@@ -136,7 +134,6 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
     assert report.count('class="violation"') == index.count('class="violation"') > 0
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_path: Path) -> None:
     shared = shipped_requirements()["DIMES-VEL"].to_table()
     for day, probability in ((1, 0.99), (2, 0.5)):
@@ -151,7 +148,6 @@ def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_pat
     ]
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_report_on_other_requirements_is_not_that_of_the_campaign(make_run: MakeRun, tmp_path: Path) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory, [{**VELOCITY, "probability": 0.1}])
@@ -160,7 +156,6 @@ def test_report_on_other_requirements_is_not_that_of_the_campaign(make_run: Make
     assert entry.report.verdicts[0].probability == VELOCITY["probability"]
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_reports_of_another_program_are_written_again(
     make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,7 +175,6 @@ def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:
     assert excerpts.cases == {2: value}
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_security_policy_contains_the_hash_of_the_script(make_run: MakeRun, tmp_path: Path) -> None:
     make_run(make_rows(6)[MIN_COLUMNS])
     text = _write_index(tmp_path)
@@ -219,7 +213,6 @@ def test_overlapping_search_folders_list_each_campaign_once(make_run: MakeRun, t
     assert find_campaigns([tmp_path / "nowhere"]) == []
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_unreadable_campaign_is_reported_and_others_are_shown(make_run: MakeRun, tmp_path: Path) -> None:
     make_run(make_rows(6)[MIN_COLUMNS], name="readable")
     damaged_run = make_run(make_rows(6)[MIN_COLUMNS], name="damaged")
@@ -230,7 +223,6 @@ def test_unreadable_campaign_is_reported_and_others_are_shown(make_run: MakeRun,
     assert "damaged" in site.index.read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_pages_of_unchanged_campaigns_are_not_rewritten(make_run: MakeRun, tmp_path: Path) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     _write_index(tmp_path)
@@ -244,7 +236,6 @@ def test_pages_of_unchanged_campaigns_are_not_rewritten(make_run: MakeRun, tmp_p
     assert "page of the first run" not in page.read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_reports_of_others_are_written_again(
     make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,7 +304,6 @@ def test_index_without_campaigns_is_written(tmp_path: Path) -> None:
     assert "0 stored campaigns" in _write_index(tmp_path)
 
 
-@pytest.mark.usefixtures("plain_figures")
 def test_failed_requirements_precede_others(make_run: MakeRun, tmp_path: Path) -> None:
     requirements = [
         {**VELOCITY, "id": "MET", "probability": 0.1},
