@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -23,6 +22,7 @@ from marsyard.reports.presentation import write_case_figures
 from marsyard.reports.report_file import PAGE_FILE
 from marsyard.reports.requirement_cases import CaseFinder, CaseSummary
 from marsyard.reports.stored import read_run
+from marsyard.reports.verdicts import find_bound
 from marsyard.scenarios.timeline import Timeline
 
 if TYPE_CHECKING:
@@ -177,10 +177,7 @@ class Result:
         column = primary_metric(frame, run.requirements) if metric is None else metric
         if column is None or column not in frame:
             raise CampaignError(f"{self.directory} has no column '{column}'")
-        bounds = (item.bound for item in self.evaluation.verdicts if item.metric == column)
-        # a requirement on a boolean column has no bound (NaN)
-        bound = next((bound for bound in bounds if math.isfinite(bound)), None)
-        drawn = FIGURES[name](frame, column, bound)
+        drawn = FIGURES[name](frame, column, find_bound(self.evaluation.verdicts, column))
         if drawn is None:
             raise CampaignError(f"{self.directory} has no values of {column} for the figure '{name}'")
         return drawn

@@ -1,10 +1,9 @@
 """Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results.
 
-The files are signed with the user's key, if there is one (`marsyard.reports.signature`).
+The files are signed with the user's key, if there is one (`marsyard.reports.report_file`).
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -23,25 +22,25 @@ from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.consistency import consistency_section
 from marsyard.reports.convergence import convergence_section
+from marsyard.reports.effects import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.failure_boundary import boundary_section
-from marsyard.reports.influences import drivers_section
 from marsyard.reports.page import page_context
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.populations import outcome_counts
 from marsyard.reports.presentation import presentations
 from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.rare import rare_bound_sentence, rare_section, rare_sentences
-from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary, sign_report
 from marsyard.reports.robustness_section import robustness_section
 from marsyard.reports.robustness_wording import robust_sentences, robustness_text
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Section, SectionMaker, Subject
-from marsyard.reports.signature import sign_report
 from marsyard.reports.stored import table
 from marsyard.reports.tables import error_summaries
 from marsyard.reports.validity import validity_section
 from marsyard.reports.verdict_files import junit_xml, requirement_evidence, verification_csv
+from marsyard.reports.verdicts import find_bound
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -119,8 +118,7 @@ def create_subject(evaluation: Evaluation) -> Subject:
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
     # the cases of a study are not a random sample; statistics of their errors would be meaningless
     metric = None if run.recorded("study") else primary_metric(random_run.frame, run.requirements)
-    bounds = (item.bound / item.scale for item in evaluation.verdicts if item.metric == metric)
-    return Subject(random_run, metric, next((bound for bound in bounds if math.isfinite(bound)), None))
+    return Subject(random_run, metric, find_bound(evaluation.verdicts, metric))
 
 
 def section_makers() -> list[SectionMaker]:

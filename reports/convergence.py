@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from marsyard.reports import rates
 from marsyard.reports.column_values import numbers
-from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.decision import evaluate_requirement
 from marsyard.reports.figure_style import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampling_design import read_sampling_design
@@ -81,19 +81,18 @@ def curve_sizes(cases: int) -> list[int]:
 def success_rate_curves(subject: Subject) -> list[Curve]:
     """Compute the success rate of each requirement that can be evaluated, from the first n cases."""
     sampling = read_sampling_design(subject.run.definition)
-    frame, requirements = subject.all_cases, subject.run.requirements
+    frame = subject.all_cases
     sizes = curve_sizes(len(frame))
-    evaluated = [(size, evaluate_requirements(frame.head(size), requirements, sampling)) for size in sizes]
-    _, final_verdicts = evaluated[-1]
     curves = []
-    for index, final in enumerate(final_verdicts):
+    for requirement in subject.run.requirements:
+        verdicts = [evaluate_requirement(frame.head(size), requirement, sampling) for size in sizes]
         points = [
-            Point(size, verdicts[index].estimate, verdicts[index].lower, verdicts[index].upper)
-            for size, verdicts in evaluated
-            if not math.isnan(verdicts[index].estimate)
+            Point(size, verdict.estimate, verdict.lower, verdict.upper)
+            for size, verdict in zip(sizes, verdicts, strict=True)
+            if not math.isnan(verdict.estimate)
         ]
         if len(points) > 1:
-            curves.append(Curve(final.requirement_id, "success rate", points, final.probability))
+            curves.append(Curve(verdicts[-1].requirement_id, "success rate", points, verdicts[-1].probability))
     return curves
 
 

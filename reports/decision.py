@@ -50,7 +50,7 @@ def evaluate_requirements(
     frame = sampling.exclude_nominal_case(frame)
     verdicts = []
     for requirement, earlier_evidence in zip_longest(requirements, earlier):
-        verdict = _evaluate(frame, requirement, sampling, earlier_evidence)
+        verdict = evaluate_requirement(frame, requirement, sampling, earlier_evidence)
         names = [name for name in verdict.population.split(" and ") if name in from_truth]
         if names:
             title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
@@ -72,7 +72,7 @@ def _evaluate_all_cases(
     wider_population = " and ".join(remaining_conditions) or "all"
     if population == wider_population:
         return None
-    result = _evaluate(frame, {**requirement, "population": wider_population}, sampling)
+    result = evaluate_requirement(frame, {**requirement, "population": wider_population}, sampling)
     if not result.n:
         return None
     return AllCases(
@@ -148,7 +148,7 @@ def _label_terrains(frame: pd.DataFrame, groups: Int[np.ndarray, " n"]) -> tuple
     )
 
 
-def _evaluate(
+def evaluate_requirement(
     frame: pd.DataFrame,
     requirement: Mapping[str, Any],
     sampling: SamplingDesign,
@@ -156,6 +156,7 @@ def _evaluate(
 ) -> Verdict:
     """Evaluate a requirement; INSUFFICIENT with a reason if the rows do not allow it, or no case is in its population.
 
+    frame: rows without the nominal case
     earlier: evidence of other confirmations of the same claim
     """
     verdict = _empty_verdict(requirement)

@@ -1,19 +1,27 @@
-"""Effects of conditions on results: correlation, and the figure that shows it."""
+"""Effects of conditions on results: correlations and their figure, and drivers.
+
+Drivers are conditions ranked by the fraction of the variance of errors and of failures that they explain.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.blocks import Quantity, condition_bins
+from marsyard.reports.column_selection import condition_columns
+from marsyard.reports.column_values import numbers
 from marsyard.reports.plots import scatter_panels
 from marsyard.reports.rates import CONFIDENCE, varies
-from marsyard.reports.section import Block, Grid, svg_figure
-from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver
-from marsyard.reports.wording import NOTHING, coefficient, format_fraction
+from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
+from marsyard.reports.statistics.difference_tests import correct_holm
+from marsyard.reports.statistics.drivers import MIN_CASES, Driver, estimate_driver
+from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, note_text, p_text, percent
 
 
 @dataclass(frozen=True)
@@ -90,3 +98,62 @@ def correlation_text(effect: Effect) -> str:
     """Format a rank correlation with its interval; a dash for NaN."""
     value, lower, upper = map(coefficient, (effect.rank_correlation, effect.lower, effect.upper))
     return NOTHING if math.isnan(effect.rank_correlation) else f"{value} ({lower} to {upper})"
+
+
+#: Maximum number of conditions in a table, and of cases that are used for the ranking.
+_MAX_DRIVERS, _MAX_DRIVER_CASES = 12, 20_000
+
+
+class RankedDriver(NamedTuple):
+    """A condition (a column of the rows) with its effect, and the p-value corrected for the number of conditions."""
+
+    column: str
+    driver: Driver
+    p_value: float
+
+
+def drivers_section(subject: Subject) -> Section | None:
+    """Create the section with the ranked drivers of errors and of failures; None without drivers."""
+    metric = subject.metric
+    if metric is None:
+        return None
+    frame = subject.frame.head(_MAX_DRIVER_CASES)
+    responses = {"the size of errors": np.abs(numbers(frame, metric))}
+    if subject.bound is not None:
+        responses["failures"] = (~populations.success_mask(frame, metric, subject.bound)).astype(np.float64)
+    columns = condition_columns(frame, metric, subject.run.is_condition)
+    ranked_drivers = {
+        name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
+    }
+    if not ranked_drivers:
+        return None
+    note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
+    headings = ["Condition", "Cases", "Rank correlation", "Interval of the correlation"]
+    headings += ["Fraction of variance", "Interval of the fraction", "p"]
+    blocks = []
+    for name, drivers in ranked_drivers.items():
+        rows = []
+        for column, driver, p_value in drivers[:_MAX_DRIVERS]:
+            ranks = [coefficient(driver.correlation), f"{coefficient(driver.lower)} to {coefficient(driver.upper)}"]
+            fractions = [percent(driver.fraction), rates.range_text(driver.fraction_lower, driver.fraction_upper)]
+            rows.append([label(column), f"{driver.n:,}", *ranks, *fractions, p_text(p_value)])
+        blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows, len(drivers) - len(rows))))
+    data = {
+        name: [{"condition": column, **asdict(driver), "corrected_p": p_value} for column, driver, p_value in drivers]
+        for name, drivers in ranked_drivers.items()
+    }
+    title = "Influence of conditions on errors and failures"
+    return Section("explained", "Influences", title, [*blocks, Block(note=note)], data)
+
+
+def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> list[RankedDriver]:
+    """Rank columns by the fraction of a response's variance that they explain, largest first; correct the p-values."""
+    groups = rates.terrain_groups(frame)
+    drivers: Mapping[str, Driver] = {
+        column: driver
+        for column in columns
+        if (driver := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
+    }
+    p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))
+    order = sorted(drivers, key=lambda column: (-drivers[column].fraction, column))
+    return [RankedDriver(column, drivers[column], p_values[column]) for column in order]

@@ -1,4 +1,4 @@
-"""Evaluation of a stored campaign: verdicts, overall verdict, and exit status.
+"""Evaluation of a stored campaign: verdicts, overall verdict, exit status, and looks at a growing campaign.
 
 A study is a run of `marsyard rare`, `search`, `budget` or `robust`; its verdict does not follow from success rates.
 """
@@ -12,14 +12,16 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.claims import hash_requirements
+from marsyard.campaigns.definition.claims import Confirmation, hash_requirements
 from marsyard.campaigns.definition.evidence import KINDS_WITHOUT_PASS, Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmation_record import locate_record
+from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import (
     JointEvidence,
+    collect_counts,
     describe_contribution,
     find_record_changes,
     qualify_verdict,
@@ -30,6 +32,8 @@ from marsyard.reports.populations import engine_failed
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.robustness_evaluation import evaluate_robustness
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 from marsyard.reports.stored import StoredRun, read_columns, read_run, table
 from marsyard.reports.validity import Validity, assess_validity
 from marsyard.reports.variants import (
@@ -39,7 +43,7 @@ from marsyard.reports.variants import (
     evaluate_variants,
     read_robust_studies,
 )
-from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count
 
 #: Headline of a study that decides no requirement.
@@ -54,6 +58,7 @@ class Evaluation:
       allows no PASS
     - verdicts: verdict of each requirement; empty for a study
     - is_qualified: whether a met requirement needs a decision of a person (`marsyard.reports.joint`)
+    - own: entry of the run in the record of confirmations; None without one
     """
 
     run: StoredRun
@@ -62,6 +67,7 @@ class Evaluation:
     verdicts: Sequence[Verdict]
     overall_verdict: OverallVerdict
     is_qualified: bool = False
+    own: Confirmation | None = None
 
     @cached_property
     def validity(self) -> Validity:
@@ -136,7 +142,7 @@ def evaluate_run(
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
     is_qualified = joint.is_confirmation and any(joint.is_qualified(verdict.requirement_id) for verdict in verdicts)
     is_qualified = is_qualified or bool(verdicts and run.unverified)
-    return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified)
+    return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified, joint.own)
 
 
 def _mark_unverified(verdict: Verdict, run: StoredRun) -> Verdict:
@@ -242,3 +248,39 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
         return replace(verdict, additional_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(verdict.withhold(reason), withheld_status=verdict.status)
+
+
+def record_look(evaluation: Evaluation) -> None:
+    """Append the result of a finished confirmation to its record, if the record contains the run."""
+    evidence, run = evaluation.evidence, evaluation.run
+    if evidence.kind is not EvidenceKind.CONFIRMATION:
+        return
+    if evaluation.own is None:  # stated in the verdict
+        return
+    counts = collect_counts(run, evaluation.own, evaluation.sampling.with_open_end)
+    results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
+    add_result(evidence, len(run.all_cases), results, counts)
+
+
+def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int) -> int | None:
+    """Return the number of cases at the next look (planned evaluation); None if the campaign may stop.
+
+    The campaign may stop if every requirement is decided or can no longer be decided by the remaining cases.
+    Requirements that are evaluated by the observed rate (`decide_by = "estimate"`) are ignored.
+    """
+    if sampling.max_cases is None or cases >= sampling.max_cases:
+        return None
+    remaining = sampling.max_cases - cases
+    risk_fraction = planned_looks(sampling.max_cases)[-1].risk_fraction
+    for verdict in verdicts:
+        if verdict.status is not Status.INSUFFICIENT or verdict.decide_by == ESTIMATE:
+            continue
+        if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
+            continue
+        confidence = confidence_at(verdict.confidence, risk_fraction)
+        successes, n = verdict.n - verdict.failures, verdict.n + remaining
+        # bounds for independent cases; bounds for shared terrains are not tighter
+        can_pass = proportion_lower(successes + remaining, n, confidence) >= verdict.probability
+        if can_pass or proportion_upper(successes, n, confidence) < verdict.probability:
+            return next(look.cases for look in planned_looks(sampling.max_cases) if look.cases > cases)
+    return None

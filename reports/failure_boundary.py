@@ -20,8 +20,8 @@ from marsyard.reports.column_selection import distinct_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.conditions import CONDITIONS
 from marsyard.reports.decision import requirement_masks
+from marsyard.reports.effects import rank_drivers
 from marsyard.reports.figure_style import INK, REQUIREMENT, in_page_style, new_axes
-from marsyard.reports.influences import rank_drivers
 from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import label, note_text, number

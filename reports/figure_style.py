@@ -44,7 +44,6 @@ _EMBEDDED_PNG, _MIN_COMPRESSED_BYTES = re.compile(r"data:image/png;base64,([\w+/
 #: Quality of compressed images (assumed: artefacts are below the noise of the detectors).
 _WEBP_QUALITY = 70
 _STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
-_STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
 
 
 def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
@@ -61,9 +60,19 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
 @contextmanager
 def _page_style(**changes: str) -> Iterator[None]:
     """Apply the page's style in a context; ignore warnings about characters that are missing from the font."""
-    with mpl.style.context(["default", _STYLE, changes]), warnings.catch_warnings():
+    with mpl.rc_context(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        # without the checks of `mpl.style.context`, which would take longer than many a figure
+        settings: Any = mpl.rcParams
+        dict.update(settings, {**_style_values(), **changes})
         yield
+
+
+@functools.cache
+def _style_values() -> dict[str, Any]:
+    """Return matplotlib's settings in the page's style."""
+    with mpl.style.context(["default", _STYLE_FILE]):
+        return {name: value for name, value in dict.items(mpl.rcParams) if name != "backend"}
 
 
 def new_axes(width: float, height: float) -> tuple[Figure, Axes]:

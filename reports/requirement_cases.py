@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.parameter_paths import leaves
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
-from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.column_values import numbers, to_float
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.images import thumbnail
+from marsyard.reports.populations import compute_margins
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun, table
@@ -156,6 +156,7 @@ class CaseFinder:
         has_numbers = "case" in self._frame
         #: Numbers of the cases that violate any requirement, in increasing order; empty for rows without numbers.
         self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if has_numbers else []
+        self._thumbnails: dict[int, str] = {}
 
     def requirement_cases(self) -> list[RequirementCases]:
         """List the cases of each requirement."""
@@ -238,10 +239,11 @@ class CaseFinder:
         unusual = self._unusual_driver(row)
         parts = [self._describe_error(item, values, violates), "" if cause is None else cause.detail, unusual]
         sentence = "; ".join(part for part in parts if part)
-        image = thumbnail(self._run.products(case)) if case in self._run.stored_cases else ""
-        return ListedCase(
-            case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", image
-        )
+        sentence = f"{sentence[:1].upper()}{sentence[1:]}."
+        if case in self._run.stored_cases and case not in self._thumbnails:
+            self._thumbnails[case] = thumbnail(self._run.products(case))
+        outcome = str(values.get("outcome", NOTHING))
+        return ListedCase(case, violates, outcome, sentence, self._thumbnails.get(case, ""))
 
     def _row(self, row: int) -> dict[str, Any]:
         return {str(name): value for name, value in self._frame.iloc[row].items()}

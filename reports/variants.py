@@ -17,9 +17,9 @@ from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVariant
 from marsyard.reports import rates
-from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.dispersion_changes import ChangeKind
+from marsyard.reports.populations import compute_margins
 from marsyard.reports.robustness import ChangeOutcome, Robustness
 from marsyard.reports.robustness_evaluation import select_met
 from marsyard.reports.sampling_design import INDEPENDENT

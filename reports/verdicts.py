@@ -10,6 +10,7 @@ grids) have no bounds; requirements with `decide_by = "estimate"` can still be d
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -221,3 +222,9 @@ def compare_bounds(lower: float, upper: float, probability: float) -> Status:
     if lower >= probability:
         return Status.PASS
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
+
+
+def find_bound(verdicts: Iterable[Verdict], metric: str | None) -> float | None:
+    """Find the bound of the first requirement on a metric that has one, in the unit of the metric's column."""
+    bounds = (item.bound / item.scale for item in verdicts if item.metric == metric)
+    return next((bound for bound in bounds if math.isfinite(bound)), None)

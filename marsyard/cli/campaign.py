@@ -124,8 +124,7 @@ def _continue_until_decided(directory: Path, executor: ExecutorConfig, observer:
     """Append cases at the planned interim evaluations until the campaign is decided."""
     from marsyard.campaigns.running.engine import append_cases
     from marsyard.campaigns.store.record import stored_definition
-    from marsyard.reports.evaluation import evaluate_run
-    from marsyard.reports.looks import next_look
+    from marsyard.reports.evaluation import evaluate_run, next_look
     from marsyard.reports.wording import count
 
     while True:

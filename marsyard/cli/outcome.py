@@ -1,6 +1,5 @@
 """Evaluation of a campaign for the commands: verdicts on the terminal, and report."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,13 +18,12 @@ from marsyard.cli.terminal import grid_table
 from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
-from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.looks import record_look
+from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
 from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.robustness_wording import robustness_text
 from marsyard.reports.terminal_tables import verdict_table
-from marsyard.reports.verdicts import Verdict
+from marsyard.reports.verdicts import Verdict, find_bound
 from marsyard.reports.wording import count
 
 Requirements: TypeAlias = Sequence[Mapping[str, Any]]
@@ -100,9 +98,7 @@ def evaluate_and_store(directory: Path, requirements: Requirements | None = None
 def _comparison_tables(frame: pd.DataFrame, requirements: Requirements, verdicts: Sequence[Verdict]) -> list[Table]:
     """Compare algorithms on the same cases; return no table for a single algorithm."""
     metric = primary_metric(frame, requirements)
-    bounds = (item.bound / item.scale for item in verdicts if item.metric == metric)
-    bound = next((bound for bound in bounds if math.isfinite(bound)), None)
-    algorithms, differences = compare_algorithms(frame, metric, bound)
+    algorithms, differences = compare_algorithms(frame, metric, find_bound(verdicts, metric))
     if not algorithms:
         return []
     titles = ("Algorithms on the same cases", f"Compared with {algorithms[0].name}")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
 from marsyard.reports import populations, rates, section
@@ -47,11 +47,10 @@ GROUNDS = {
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     """Compute fractions of correct answers by class of the true ground; classes without cases are omitted."""
-    is_reported, has_no_safe_site, has_wide_site = (
-        populations.flag_mask(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists")
+    is_reported, is_refused, is_safe = (
+        populations.flag_mask(frame, name) for name in ("site_reported", "no_site_reported", "site_safe")
     )
-    is_refused, is_safe = populations.flag_mask(frame, "no_site_reported"), populations.flag_mask(frame, "site_safe")
-    has_narrow_site = populations.flag_mask(frame, "safe_site_exists") & ~has_wide_site
+    has_wide_site, has_narrow_site, has_no_safe_site = _ground_masks(frame).values()
     is_correct = is_refused | (is_reported & is_safe)
     fractions = {
         "reported sites that are truly safe": rates.fraction_of(is_safe[is_reported], frame[is_reported]),
@@ -66,16 +65,20 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     return {name: fraction for name, fraction in fractions.items() if fraction.n}
 
 
-def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
-    """Count flights by true ground (`GROUNDS`) and name of the outcome (`ANSWERS`)."""
+def _ground_masks(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
+    """Create the mask of each class of the true ground (`GROUNDS`)."""
     has_wide_site, has_safe_site, has_no_safe_site = (
         populations.flag_mask(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
     )
+    return dict(zip(GROUNDS, (has_wide_site, has_safe_site & ~has_wide_site, has_no_safe_site), strict=True))
+
+
+def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
+    """Count flights by true ground (`GROUNDS`) and name of the outcome (`ANSWERS`)."""
     answer_masks = classify_answers(frame)
-    ground_masks = dict(zip(GROUNDS, (has_wide_site, has_safe_site & ~has_wide_site, has_no_safe_site), strict=True))
     return {
         ground: {answer.name: int((ground_mask & answer_masks[key]).sum()) for key, answer in ANSWERS.items()}
-        for ground, ground_mask in ground_masks.items()
+        for ground, ground_mask in _ground_masks(frame).items()
     }
 
 

@@ -21,8 +21,8 @@ from marsyard.campaigns.store import record
 from marsyard.cli.campaign import run_until_decided
 from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.evaluation import next_look
 from marsyard.reports.gallery import gallery_candidates
-from marsyard.reports.looks import next_look
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign

@@ -23,3 +23,9 @@ def make_run(tmp_path: Path) -> MakeRun:
 def dimes_products() -> dict[str, Any]:
     """Return products of a synthetic DIMES case; see `synthetic_products`."""
     return synthetic_products()
+
+
+@pytest.fixture
+def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the SVG of figures, for tests that write reports but do not read their figures: most of the time."""
+    monkeypatch.setattr("marsyard.reports.section.svg_markup", lambda *_: "<svg></svg>")

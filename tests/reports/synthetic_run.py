@@ -1,4 +1,4 @@
-"""Folders of synthetic runs of descents, with rows of known statistics."""
+"""Folders of synthetic runs of descents, with rows of known statistics, and subjects of reports."""
 
 import hashlib
 import json
@@ -11,6 +11,8 @@ import pandas as pd
 
 from marsyard.campaigns.store.products import pack_products, save_packed
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import StoredRun
 
 VELOCITY: Mapping[str, Any] = {
     "id": "DIMES-VEL",
@@ -21,6 +23,8 @@ VELOCITY: Mapping[str, Any] = {
     "confidence": 0.9,
     "population": "valid",
 }
+#: Minimum columns of a report.
+MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 #: Type of the fixture `make_run`.
 MakeRun = Callable[..., Path]
 
@@ -84,6 +88,11 @@ def _mark_crashed(frame: pd.DataFrame, n_crashed: int) -> pd.DataFrame:
     frame.loc[rows, "error"] = "RuntimeError: the context is lost"
     frame.loc[rows, "traceback"] = 'Traceback (most recent call last):\n  File "x.py", line 1\nRuntimeError: lost'
     return frame
+
+
+def make_subject(frame: pd.DataFrame, metric: str | None = None, bound: float | None = None, **record: Any) -> Subject:
+    """Return the subject of a report on rows; `record` are the entries of the campaign's record."""
+    return Subject(StoredRun(Path("run"), frame, frame, record, ()), metric, bound)
 
 
 def synthetic_products(seed: int = 1) -> dict[str, Any]:

@@ -25,8 +25,8 @@ from marsyard.reports.papers import paper_section
 from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.presentation import Presentation, presentations
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
-from marsyard.reports.stored import StoredRun
 from marsyard.scenarios.systems import System
+from tests.reports.synthetic_run import make_subject
 
 ERROR = Quantity("altitude_error_m")
 ANSWERED = Rate("answered", "Answered", flag_rate("answered"))
@@ -49,10 +49,6 @@ def altitude_section(subject: Subject) -> Section | None:
         scatter_block(frame, "scatter", [Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
         Block(note="Synthetic data."),
     )
-
-
-def make_subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subject:
-    return Subject(StoredRun(Path("run"), frame, frame, {"name": name}, ()), "altitude_error_m", 5.0)
 
 
 def make_rows_of_two_altitudes() -> pd.DataFrame:
@@ -120,13 +116,13 @@ def test_paper_values_are_compared_with_results(tmp_path: Path) -> None:
         ]
         """
     )
-    section = paper_section(make_subject(make_rows_of_two_altitudes()), path)
+    section = paper_section(make_subject(make_rows_of_two_altitudes(), name="altitude-flight-2"), path)
     assert section.data == {
         "altitude error (cm)": {"paper": "120", "ours": "100 (100 to 200)"},
         "answered": {"paper": "–", "ours": "30 of 40: 75.00 %"},
         "slope": {"paper": "3", "ours": "–"},
     }
-    assert paper_section(make_subject(make_rows_of_two_altitudes(), "another"), path) is None
+    assert paper_section(make_subject(make_rows_of_two_altitudes(), name="another"), path) is None
 
 
 @pytest.fixture
@@ -145,6 +141,7 @@ def register_altitude_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str],
 REPORT = Presentation(sections=(altitude_section,))
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_sections_of_a_registered_system_are_written(
     register_altitude_system: Callable[[str], None], make_run: Callable[..., Path]
 ) -> None:

@@ -1,7 +1,6 @@
 """Tests of failure boundaries (fitted probability of a violation): true probabilities, and fits without skill."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,7 @@ import pytest
 from scipy.special import expit
 
 from marsyard.reports.failure_boundary import boundary_section, fit_probability, validate_fit
-from marsyard.reports.section import Subject
-from marsyard.reports.stored import StoredRun
+from tests.reports.synthetic_run import make_subject
 
 CONDITIONS = ("sun_elevation_deg", "off_nadir_max_deg")
 REQUIREMENT = {"id": "VEL", "metric": "velocity_error_m_s", "bound": 5.0, "population": "all"}
@@ -36,8 +34,7 @@ def make_rows(n: int, seed: int, probability: Callable[..., np.ndarray] = true_p
 
 
 def make_section(frame: pd.DataFrame) -> Any:
-    run = StoredRun(Path("run"), frame, frame, {"requirements": [REQUIREMENT]}, ())
-    return boundary_section(Subject(run, "velocity_error_m_s", 5.0))
+    return boundary_section(make_subject(frame, "velocity_error_m_s", 5.0, requirements=[REQUIREMENT]))
 
 
 def test_boundary_of_two_true_conditions_is_drawn() -> None:

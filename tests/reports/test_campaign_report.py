@@ -15,14 +15,14 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.record import describe_machine
-from marsyard.reports.campaign_report import write_report
+from marsyard.reports.campaign_report import create_subject, write_report
+from marsyard.reports.common_sections import answer_fractions
+from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.report_file import SCHEMA
-from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
+from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, MakeRun, make_rows
 
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
-#: Minimum columns of a report.
-MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 #: Text that would run a script or a template if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
@@ -123,7 +123,7 @@ def test_report_is_valid_for_any_run(make_run: MakeRun, kind: str) -> None:
 
 
 def test_small_report_contains_the_main_results(make_run: MakeRun, dimes_products: dict[str, Any]) -> None:
-    directory = make_run(make_rows(24, n_crashed=1), products=dimes_products)
+    directory = make_run(make_rows(24, n_crashed=1)[FULL_COLUMNS], products=dimes_products)
     text, page, report = _write_and_read(directory)
     _check_page(text, page)
     visible_text = " ".join(re.sub(r"<[^>]+>", " ", text).split())
@@ -148,6 +148,7 @@ def test_small_report_contains_the_main_results(make_run: MakeRun, dimes_product
     assert len(text) < 2_000_000
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_requirement_met_by_rate_has_its_own_symbol(make_run: MakeRun) -> None:
     requirement = {**VELOCITY, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
     directory = make_run(make_rows(24)[MIN_COLUMNS], [requirement])
@@ -200,6 +201,7 @@ def test_texts_from_files_are_escaped(make_run: MakeRun, dimes_products: dict[st
         '{"name": "\\ud800", "seed": [1], "description": {"a": "b"}}',
     ],
 )
+@pytest.mark.usefixtures("plain_figures")
 def test_damaged_record_gives_a_valid_page(make_run: MakeRun, record: str) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     (directory / "campaign.json").write_text(record, encoding="utf-8")
@@ -207,6 +209,7 @@ def test_damaged_record_gives_a_valid_page(make_run: MakeRun, record: str) -> No
     _check_page(text, page)
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_missing_record_and_damaged_products_give_a_valid_page(make_run: MakeRun) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS], products={"image_1": np.zeros((4, 4))})
     (directory / "campaign.json").unlink()
@@ -216,6 +219,7 @@ def test_missing_record_and_damaged_products_give_a_valid_page(make_run: MakeRun
     _check_page(text, page)
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_interrupted_campaign_is_marked(make_run: MakeRun) -> None:
     text, _, report = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
     assert "Not finished." in text
@@ -241,12 +245,12 @@ def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun) 
     """The requirement multiplies the metric by 60: 60 x 0.05 is above the bound of 2, 60 x 0.01 is not."""
     frame = make_rows(24).assign(velocity_error_m_s=np.where(np.arange(24) < 6, 0.05, 0.01), answered=True)
     requirement = {"id": "SCALED", "metric": "velocity_error_m_s", "bound": 2.0, "scale": 60.0}
-    _, _, report = _write_and_read(
-        make_run(frame=frame, requirements=[requirement | {"probability": 0.9, "confidence": 0.9}])
-    )
-    answers = report["sections"]["answers"]
+    directory = make_run(frame=frame, requirements=[requirement | {"probability": 0.9, "confidence": 0.9}])
+    subject = create_subject(evaluate_run(directory))
+    assert subject.bound == pytest.approx(2.0 / 60.0)
+    answers = answer_fractions(subject)
     wrong_answers = next(fraction for name, fraction in answers.items() if name.startswith("wrong"))
-    assert (wrong_answers["hits"], wrong_answers["n"]) == (6, 24)
+    assert (wrong_answers.hits, wrong_answers.n) == (6, 24)
 
 
 def test_reports_contain_no_folder_of_the_user(
@@ -257,7 +261,9 @@ def test_reports_contain_no_folder_of_the_user(
     monkeypatch.setenv("MARSYARD_CACHE", "/scratch/alice/cache")
     command = {"words": ["marsyard", "run", f"{home}/x.toml"], "folder": str(home / "my project")}
     environment = {"machine": "x86_64", "variables": {"MARSYARD_TOKEN": "secret"}}
-    frame = make_rows(12, n_crashed=1).assign(error=f"cannot read {home}/a.npy, /scratch/alice/cache/terrain/1.npy")
+    frame = make_rows(12, n_crashed=1)[FULL_COLUMNS].assign(
+        error=f"cannot read {home}/a.npy, /scratch/alice/cache/terrain/1.npy"
+    )
     directory = make_run(frame, command=command, environment=environment, name="home of alice/run")
     write_report(directory)
     for path in directory.iterdir():

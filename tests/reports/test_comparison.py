@@ -12,10 +12,9 @@ from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid,
 from marsyard.reports.comparison import compare_algorithms, comparison_section, select_algorithm
 from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.metrics import list_metrics
-from marsyard.reports.section import Subject
 from marsyard.reports.statistics.difference_tests import difference_p_value
-from marsyard.reports.stored import StoredRun, read_run
-from tests.reports.synthetic_run import MakeRun, make_rows
+from marsyard.reports.stored import read_run
+from tests.reports.synthetic_run import MakeRun, make_rows, make_subject
 
 
 def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd.DataFrame:
@@ -43,7 +42,7 @@ def test_paired_comparison_averages_the_cases_that_both_algorithms_answer() -> N
 def test_cases_without_all_algorithms_are_left_out_and_counted() -> None:
     frame = make_paired_rows([1.0] * 8, [2.0] * 8).astype({"other.answered": object})
     frame.loc[:1, "other.answered"] = None
-    section = comparison_section(Subject(StoredRun(Path("run"), frame, frame, {}, ()), "velocity_error_m_s", 5.0))
+    section = comparison_section(make_subject(frame, "velocity_error_m_s", 5.0))
     assert section is not None
     assert section.blocks[0].note == "Left out: 2 cases that ended before all algorithms had run."
 

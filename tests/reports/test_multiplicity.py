@@ -9,7 +9,7 @@ from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.verdicts import Verdict
-from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
+from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, MakeRun, make_rows
 
 
 def _make_verdict(confidence: float, decide_by: str = "confidence", n: int = 100) -> Verdict:
@@ -29,9 +29,10 @@ def test_risks_of_requirements_are_added() -> None:
 
 
 @pytest.mark.parametrize("requirements", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.usefixtures("plain_figures")
 def test_statement_is_printed_and_shown(make_run: MakeRun, tmp_path: Path, requirements: int) -> None:
     second = {**VELOCITY, "id": "SECOND", "bound": 9.0}
-    directory = make_run(make_rows(24), [VELOCITY, second][:requirements])
+    directory = make_run(make_rows(12)[MIN_COLUMNS], [VELOCITY, second][:requirements])
     console = Console(record=True, width=200)
     evaluate_and_report(directory, console)
     write_site(tmp_path / "site", [directory])

@@ -13,7 +13,6 @@ import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
-from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
@@ -22,6 +21,7 @@ from marsyard.reports.gallery import MAX_SHOWN_VIOLATIONS, gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.images import thumbnail
 from marsyard.reports.localisation.presentation import LOCALISATION
+from marsyard.reports.populations import compute_margins
 from marsyard.reports.presentation import Cause, Presentation
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
 from marsyard.reports.vtt.presentation import VTT
@@ -56,6 +56,14 @@ AVAILABLE: Mapping[str, Any] = {"id": "A", "metric": "answered", "probability": 
 def _make_finder(make_run: MakeRun, frame: pd.DataFrame, *requirements: Mapping[str, Any]) -> CaseFinder:
     evaluation = evaluate_run(make_run(frame, requirements))
     return CaseFinder(evaluation.run, evaluation.verdicts)
+
+
+def test_stored_cases_have_a_preview_in_each_list(make_run: MakeRun, dimes_products: dict[str, Any]) -> None:
+    frame = make_rows(6, answer_rate=0.0)
+    evaluation = evaluate_run(make_run(frame, [AVAILABLE, {**AVAILABLE, "id": "B"}], products=dimes_products))
+    for entry in CaseFinder(evaluation.run, evaluation.verdicts).requirement_cases():
+        previews = {listed.case: listed.thumbnail for listed in entry.violations}
+        assert previews == dict.fromkeys(range(6), "") | {3: thumbnail(dimes_products)}
 
 
 def test_rows_without_numbers_have_no_listed_violations(make_run: MakeRun) -> None:

@@ -286,7 +286,7 @@ def test_pass_at_no_change_is_that_of_the_verdict(tmp_path: Path, failures: int)
 def test_shared_terrains_widen_the_bounds_as_in_the_verdict(tmp_path: Path) -> None:
     """Pairs of failures on few terrains: PASS is not claimed under a change if the verdict has no PASS."""
     terrains = np.arange(600) // 3
-    for failures in range(2, 24, 3):
+    for failures in range(2, 24, 7):
         is_failed = np.arange(600) < failures
         verdicts, records, _ = evaluate(tmp_path, 600, 0.95, partial(_given, is_failed), terrain=terrains)
         assert {item.lower > 0.0 for item in records.values()} <= {verdicts[0].status is Status.PASS}, failures

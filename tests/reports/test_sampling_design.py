@@ -46,7 +46,7 @@ def test_terrains_in_turn_are_independent_draws() -> None:
 
 @pytest.mark.parametrize(("definition", "message"), DESIGNS)
 def test_designs_without_independent_draws_have_no_confidence(definition: dict[str, Any], message: str) -> None:
-    frame, design = make_rows(2000), read_sampling_design(definition)
+    frame, design = make_rows(400), read_sampling_design(definition)
     requirements = [{**VELOCITY, "probability": probability} for probability in (0.5, VELOCITY["probability"])]
     for verdict, reference in zip(
         evaluate_requirements(frame, requirements, design), evaluate_requirements(frame, requirements), strict=True

@@ -1,7 +1,6 @@
 """Tests of optional report sections with rows of known statistics."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,17 +11,19 @@ from marsyard.reports.campaign_report import write_report
 from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
+from marsyard.reports.convergence import success_rate_curves
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
-from marsyard.reports.influences import drivers_section
+from marsyard.reports.effects import drivers_section
 from marsyard.reports.section import Section, Subject
-from marsyard.reports.stored import StoredRun
-from tests.reports.synthetic_run import MakeRun, make_rows
+from tests.reports import synthetic_run
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 METRIC = "velocity_error_m_s"
 
 
 def make_subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
-    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), METRIC, bound)
+    return synthetic_run.make_subject(frame, METRIC, bound)
 
 
 def find_cells(section: Section | None, row: str) -> list[str]:
@@ -161,8 +162,7 @@ def test_false_fixes_are_wrong_answers_whatever_is_reported_later() -> None:
     # three crashed cases, without flags
     crashed = pd.DataFrame({"fault": ["haze"] * 3, "fault_size": 1.0, "answered": False, "outcome": "CRASHED"})
     frame = pd.concat([frame, crashed], ignore_index=True)
-    run = StoredRun(Path("run"), frame, frame, {"scenario": "localisation"}, ())
-    subject = Subject(run, "position_error_at_10_s_m", 40.0)
+    subject = synthetic_run.make_subject(frame, "position_error_at_10_s_m", 40.0, scenario="localisation")
     name, wrong = list(answer_fractions(subject).items())[-1]
     assert name.startswith("wrong answers: a reported position is more than 40 m from the true one (of cases")
     assert (wrong.hits, wrong.n) == (50, 100)
@@ -269,17 +269,31 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     assert landing_section(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
+def test_convergence_is_that_of_the_first_cases() -> None:
+    """The first half of the cases violates the requirement, the other half does not."""
+    frame = make_rows(64, answer_rate=1.0, terrains=10_000)
+    frame[METRIC] = np.where(np.arange(64) < 32, 9.0, 1.0)
+    requirement = {**VELOCITY, "population": "all"}
+    (curve,) = success_rate_curves(synthetic_run.make_subject(frame, METRIC, 5.0, requirements=[requirement]))
+    sizes = [point.cases for point in curve.points]
+    assert (sizes[0], sizes[-1], curve.required) == (8, 64, VELOCITY["probability"])
+    assert [point.estimate for point in curve.points] == pytest.approx([max(0, n - 32) / n for n in sizes])
+    (verdict,) = evaluate_requirements(frame, [requirement])
+    assert (curve.points[-1].lower, curve.points[-1].upper) == (verdict.lower, verdict.upper)
+
+
+@pytest.mark.usefixtures("plain_figures")
 def test_page_and_json_contain_every_section(make_run: MakeRun) -> None:
     rng = np.random.default_rng(4)
-    frame = make_rows(120).assign(
+    frame = make_rows(80).assign(
         feasible_overlap=True,
-        descent_rate_m_s=rng.normal(75.0, 3.0, 120),
-        fault=["dust", "cable noise"] * 60,
-        fault_size=[0.1, 0.1, 0.2, 0.2] * 30,
-        touchdown_speed_corrected_m_s=rng.uniform(0.0, 10.0, 120),
-        touchdown_speed_uncorrected_m_s=rng.uniform(0.0, 30.0, 120),
+        descent_rate_m_s=rng.normal(75.0, 3.0, 80),
+        fault=["dust", "cable noise"] * 40,
+        fault_size=[0.1, 0.1, 0.2, 0.2] * 20,
+        touchdown_speed_corrected_m_s=rng.uniform(0.0, 10.0, 80),
+        touchdown_speed_uncorrected_m_s=rng.uniform(0.0, 30.0, 80),
     )
-    directory = make_run(frame)
+    directory = make_run(frame.drop(columns=["sun_elevation_deg", "horizontal_speed_m_s", "off_nadir_max_deg"]))
     text = write_report(directory).read_text(encoding="utf-8")
     report: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     keys = ["robustness", "answers", "scatter", "explained", "convergence", "faults", "validity", "landing"]

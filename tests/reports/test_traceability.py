@@ -6,12 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
+import pytest
+
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.verdict_files import COLUMNS, junit_xml, requirement_evidence, verification_csv
-from tests.reports.synthetic_run import VELOCITY, make_rows
+from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, make_rows
 
+pytestmark = pytest.mark.usefixtures("plain_figures")
 #: Text that a spreadsheet would evaluate and XML cannot contain.
 HOSTILE = '=HYPERLINK("x")\x00<&>'
 
@@ -61,7 +64,7 @@ def test_junit_lists_failures_and_undecided_requirements() -> None:
 
 
 def test_junit_skips_the_completion_of_an_unfinished_campaign(make_run: Callable[..., Path]) -> None:
-    directory = make_run(make_rows(24), [], state="interrupted")
+    directory = make_run(make_rows(8)[MIN_COLUMNS], [], state="interrupted")
     write_report(directory)
     (completion_case,) = Xml.parse(directory / "junit.xml").getroot()  # noqa: S314
     assert _read_message(completion_case, "skipped") == "INSUFFICIENT: the campaign is not finished"
@@ -75,7 +78,7 @@ def test_junit_states_that_no_case_gives_no_lower_bound() -> None:
 
 
 def test_report_writes_matrix_and_junit_files(make_run: Callable[..., Path]) -> None:
-    directory = make_run(make_rows(24)[["case", "outcome", "answered", "velocity_error_m_s"]])
+    directory = make_run(make_rows(8)[MIN_COLUMNS])
     write_report(directory)
     assert (directory / "verification.csv").read_text().startswith("requirement,statement,")
     assert Xml.parse(directory / "junit.xml").getroot().get("name") == "dimes-synthetic"  # noqa: S314

@@ -16,7 +16,7 @@ from marsyard.reports.report_file import read_report
 from marsyard.reports.validation_rows import Conditions, RowKind, ValidationRow, read_checks
 from marsyard.sim.terrain import sites
 from tests.command import marsyard
-from tests.reports.synthetic_run import MakeRun, make_rows
+from tests.reports.synthetic_run import MIN_COLUMNS, MakeRun, make_rows
 
 _SLOPE_DEG = sites()["gusev"].terrain("descent").rms_slope_deg
 #: A met verification, a met comparison with fitted data, and a missed comparison with other data.
@@ -49,7 +49,7 @@ def _rows(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def run(make_run: MakeRun) -> Path:
     """Write a run of 40 cases over Gusev with the sun at 20, 21 ... 59 deg."""
-    frame = make_rows(40)
+    frame = make_rows(40)[MIN_COLUMNS]
     frame["sun_elevation_deg"] = 20.0 + np.arange(40)
     frame["altitude_1_m"] = 2000.0
     frame["site"] = "gusev"
@@ -112,6 +112,7 @@ def test_rows_of_other_systems_are_ignored(run: Path, monkeypatch: pytest.Monkey
     assert rows_of_system("vtt") == [other]
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_terminal_report_and_json_state_the_domain_and_missed_checks(run: Path) -> None:
     _, out, _ = marsyard("report", run)
     outside = (
@@ -129,9 +130,10 @@ def test_terminal_report_and_json_state_the_domain_and_missed_checks(run: Path) 
     assert [item.kind for item in report.validity.missed] == [RowKind.VALIDATION]
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_system_of_another_package_has_no_domain(make_run: MakeRun) -> None:
     definition = {"name": "other", "scenario": "mine:Scenario", "requirements": []}
-    directory = make_run(make_rows(40), requirements=[], definition=definition, scenario="mine:Scenario")
+    directory = make_run(make_rows(8)[MIN_COLUMNS], requirements=[], definition=definition, scenario="mine:Scenario")
     write_report(directory)
     assert read_validity(directory) == validity.Validity()
 

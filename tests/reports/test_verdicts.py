@@ -17,6 +17,8 @@ from marsyard.reports.verdicts import Status
 from tests.reports.single_verdict import evaluate, make_cases
 from tests.reports.synthetic_run import VELOCITY, make_rows
 
+VELOCITY_90, VELOCITY_95 = ({**VELOCITY, "probability": rate, "population": "all"} for rate in (0.9, 0.95))
+
 
 def test_verdict_passes_at_the_minimum_number_of_cases() -> None:
     # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (binomial distribution)
@@ -143,12 +145,11 @@ def test_boolean_metric_counts_true_as_success() -> None:
 
 def test_populations_combine_columns() -> None:
     frame = make_cases(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
-    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = evaluate(frame, requirement, population="valid and feasible_overlap")
+    verdict = evaluate(frame, VELOCITY_90, population="valid and feasible_overlap")
     assert (verdict.n, verdict.failures) == (40, 10)
     assert (
         "feasible_overlap"
-        in evaluate(frame.assign(feasible_overlap=np.arange(100.0)), requirement, population="feasible_overlap").note
+        in evaluate(frame.assign(feasible_overlap=np.arange(100.0)), VELOCITY_90, population="feasible_overlap").note
     )
 
 
@@ -157,12 +158,11 @@ def test_unknown_membership_counts_as_failure(outcome: str) -> None:
     frame = make_cases(100, 0).assign(feasible_overlap=np.arange(100) < 50).astype({"feasible_overlap": object})
     frame.loc[90:93, "outcome"] = outcome
     frame.loc[90:93, "feasible_overlap"] = None
-    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = evaluate(frame, requirement, population="feasible_overlap")
+    verdict = evaluate(frame, VELOCITY_90, population="feasible_overlap")
     assert (verdict.n, verdict.failures) == (54, 4)
     # cases 92 and 93 are excluded by the second condition
     frame["is_near"] = np.arange(100) < 92
-    verdict = evaluate(frame, requirement, population="feasible_overlap and is_near")
+    verdict = evaluate(frame, VELOCITY_90, population="feasible_overlap and is_near")
     assert (verdict.n, verdict.failures) == (52, 2)
 
 
@@ -183,37 +183,35 @@ def test_crashed_cases_are_failures_of_availability() -> None:
 
 def test_crashed_case_with_a_small_error_fails() -> None:
     frame = make_cases(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
-    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
-    assert evaluate(frame, requirement, population="all", decide_by="estimate").failures == 2
+    assert evaluate(frame, VELOCITY_95, population="all", decide_by="estimate").failures == 2
 
 
 @pytest.mark.parametrize("population", ["valid", "answered", "completed", "valid and is_near"])
 def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) -> None:
     """The verdict is INSUFFICIENT if it depends on whether crashed cases belong to the population."""
-    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
     frame = make_cases(50, 0).assign(is_near=True)
     frame.loc[:9, "outcome"] = "CRASHED"
     frame.loc[:9, "answered"] = False
     for rule in ("confidence", "estimate"):
-        verdict = evaluate(frame, requirement, population=population, decide_by=rule)
+        verdict = evaluate(frame, VELOCITY_90, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not finish" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
     few_crashes = make_cases(200, 0).assign(is_near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
-    assert evaluate(few_crashes, requirement, population=population).status is Status.PASS
+    assert evaluate(few_crashes, VELOCITY_90, population=population).status is Status.PASS
     # cases that finished only in a second attempt count like crashed ones
     repeated = make_cases(50, 0).assign(is_near=True, case_attempts=np.where(np.arange(50) < 10, 2, 1))
     for rule in ("confidence", "estimate"):
-        verdict = evaluate(repeated, requirement, population=population, decide_by=rule)
+        verdict = evaluate(repeated, VELOCITY_90, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 50, 0)
         assert verdict.note.startswith("10 cases finished only in a second attempt.")
-    assert evaluate(repeated, requirement, population="all").status is Status.INSUFFICIENT
-    assert evaluate(repeated.assign(is_near=repeated["case"] >= 10), requirement, population="is_near").n == 40
-    assert evaluate(few_crashes.assign(case_attempts=2 - few_crashes["answered"]), requirement).status is Status.PASS
+    assert evaluate(repeated, VELOCITY_90, population="all").status is Status.INSUFFICIENT
+    assert evaluate(repeated.assign(is_near=repeated["case"] >= 10), VELOCITY_90, population="is_near").n == 40
+    assert evaluate(few_crashes.assign(case_attempts=2 - few_crashes["answered"]), VELOCITY_90).status is Status.PASS
     outside_population = frame.assign(is_near=frame["answered"])
-    assert evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
+    assert evaluate(outside_population, VELOCITY_90, population="valid and is_near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains() -> None:

@@ -35,6 +35,8 @@ def _missed_check(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     rows = [row for check in read_checks(path).values() for row in check.rows]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("marsyard.reports.assurance.package.VALIDATION_FILE", path)
+        # no test reads the figures of a report, which take most of the time
+        patch.setattr("marsyard.reports.section.svg_markup", lambda *_: "<svg></svg>")
         patch.setattr(
             "marsyard.reports.validity.rows_of_system", lambda system: [row for row in rows if row.concerns(system)]
         )
@@ -284,7 +286,7 @@ def test_page_opens_offline(stored: Path) -> None:
 
 
 def test_packages_of_two_runs_of_a_campaign_have_two_folders(tmp_path: Path) -> None:
-    runs = [write_stored_run(tmp_path / name, cases=20) for name in ("a", "b")]
+    runs = [write_stored_run(tmp_path / name, cases=12) for name in ("a", "b")]
     status, out, _ = marsyard("assure", *runs, "--out", tmp_path / "package")
     assert status == 0
     assert sorted(path.name for path in (tmp_path / "package/runs").iterdir()) == [
@@ -300,7 +302,7 @@ def test_packages_of_two_runs_of_a_campaign_have_two_folders(tmp_path: Path) -> 
     [({"state": "interrupted"}, "is not finished"), ({"study": {"kind": "search"}}, "contains a study")],
 )
 def test_studies_and_unfinished_campaigns_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
-    run = write_stored_run(tmp_path / "run", cases=20, **changes)
+    run = write_stored_run(tmp_path / "run", cases=12, **changes)
     status, _, error = marsyard("assure", run, "--out", tmp_path / "package")
     assert status == 2
     assert message in error
@@ -325,7 +327,7 @@ def test_invalid_commands_have_one_message(tmp_path: Path) -> None:
 
 
 def test_key_that_does_not_exist_leaves_no_package(tmp_path: Path) -> None:
-    run = write_stored_run(tmp_path / "run", cases=20)
+    run = write_stored_run(tmp_path / "run", cases=12)
     status, _, error = marsyard("assure", run, "--out", tmp_path / "package", "--sign", tmp_path / "key")
     assert (status, "no such file" in error, (tmp_path / "package").exists()) == (2, True, False)
 
@@ -353,7 +355,7 @@ def test_package_verifies_in_another_home_folder(tmp_path: Path, monkeypatch: py
     """The report hides the home folder of its author in the path of a program, the record does not."""
     program = "/home/author/estimator"
     algorithm = {"spec": f"exec:{program} --fast", "role": "tested", "path": program, "options": {}}
-    run = write_stored_run(tmp_path / "run", cases=20, algorithms=[algorithm])
+    run = write_stored_run(tmp_path / "run", cases=12, algorithms=[algorithm])
     monkeypatch.setenv("HOME", "/home/author")
     (tmp_path / "package").mkdir()
     write_package([run], tmp_path / "package")

@@ -14,18 +14,17 @@ from markupsafe import escape
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
-from marsyard.reports import signature
+from marsyard.reports import report_file
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dashboard.entries import find_campaigns, make_slug, read_entries
-from marsyard.reports.dashboard.excerpts import read_excerpts
 from marsyard.reports.dashboard.requirement_rows import margin_text, requirement_rows, sparkline
-from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.dashboard.site import read_excerpts, write_site
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.verdicts import Status, Verdict
-from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows, write_table_with_seal
+from tests.reports.synthetic_run import MIN_COLUMNS, VELOCITY, MakeRun, make_rows, write_table_with_seal
 
-MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
+pytestmark = pytest.mark.usefixtures("plain_figures")
 #: Text that would run a script or leave the folder of the site if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'../../{{ 7*7 }}"
 
@@ -37,7 +36,7 @@ def _write_index(tmp_path: Path) -> str:
 
 def test_index_lists_all_requirements_and_campaigns(make_run: MakeRun, tmp_path: Path) -> None:
     for day in (1, 2, 3):
-        make_run(make_rows(24, seed=day)[MIN_COLUMNS], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
+        make_run(make_rows(8, seed=day)[MIN_COLUMNS], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
     text = _write_index(tmp_path)
     for name in shipped_requirements():
         assert f'data-requirement="{name}"' in text
@@ -59,7 +58,7 @@ def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path
     paths = []
     for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
         record_changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
-        frame = make_rows(24, seed=day)[MIN_COLUMNS].assign(site=["east", "west"] * 12, algorithm="mine")
+        frame = make_rows(8, seed=day)[MIN_COLUMNS].assign(site=["east", "west"] * 4, algorithm="mine")
         record = make_run(frame, **record_changes) / "campaign.json"
         paths.append(record.parent.rename(tmp_path / name))
         text = (tmp_path / name / "campaign.json").read_text()
@@ -74,10 +73,10 @@ def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path
 
 def test_confirmations_precede_later_explorations(make_run: MakeRun, tmp_path: Path) -> None:
     """A FAIL of a confirmation is the headline also after explorations with PASS, which are marked everywhere."""
-    requirement = {**VELOCITY, "population": "all"}
+    requirement = {**VELOCITY, "population": "all", "probability": 0.8}
     confirmation = {"kind": "confirmation", "number": 1, "claim": "0f", "record": str(tmp_path / "none.jsonl")}
     for day, (name, error, evidence) in enumerate([("old", 9.0, confirmation), ("b", 1.0, None), ("c", 1.0, None)]):
-        frame = make_rows(400, answer_rate=1.0, terrains=100_000).assign(velocity_error_m_s=error)[MIN_COLUMNS]
+        frame = make_rows(12, answer_rate=1.0).assign(velocity_error_m_s=error)[MIN_COLUMNS]
         make_run(frame, [requirement], name=name, evidence=evidence, started_utc=f"2026-01-0{day + 1}T00:00:00Z")
     site = tmp_path / "site"
     write_site(site, [tmp_path / name for name in ("old", "b", "c")])
@@ -112,13 +111,14 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
     make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A campaign costs neither an evaluation nor a figure: both are parts of the report that this user has written."""
-    directory = make_run(make_rows(24, error_scale=4.0)[MIN_COLUMNS], products=dimes_products)
+    rows = make_rows(12, error_scale=4.0)[MIN_COLUMNS]
+    directory = make_run(rows, products=dimes_products)
     report = write_report(directory).read_text(encoding="utf-8")
 
     def fail(*_: Any, **__: Any) -> None:
         raise AssertionError("evaluated or drawn again")
 
-    for name in ("marsyard.reports.dashboard.entries.evaluate_run", "matplotlib.figure.Figure.savefig"):
+    for name in ("marsyard.reports.dashboard.entries.evaluate_run", "marsyard.reports.section.svg_markup"):
         monkeypatch.setattr(name, fail)
     monkeypatch.setattr(CaseFinder, "__init__", fail)
     assert write_site(tmp_path / "site", [directory]).campaigns == 1
@@ -127,8 +127,7 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
     assert (folder / "report.html").read_text(encoding="utf-8") == report
     figures = report.partition('<article id="case-3"')[2].partition("</article>")[0].count("<svg")
     assert case.count("<svg") == figures > 0
-    outcome = make_rows(24, error_scale=4.0)["outcome"][3]
-    assert f"<h1>Case 3: {outcome}</h1>" in case
+    assert f"<h1>Case 3: {rows['outcome'][3]}</h1>" in case
     assert '<th scope="row">velocity_error_m_s</th>' in case
     assert f"marsyard replay {directory} 3" in case
     assert 'href="case-3.html"' in index
@@ -139,12 +138,8 @@ def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_pat
     shared = shipped_requirements()["DIMES-VEL"].to_table()
     for day, probability in ((1, 0.99), (2, 0.5)):
         requirement = {**shared, "probability": probability}
-        make_run(
-            make_rows(24, error_scale=0.1)[MIN_COLUMNS],
-            [requirement],
-            name=f"run-{day}",
-            started_utc=f"2026-01-0{day}T00:00:00Z",
-        )
+        rows = make_rows(12, error_scale=0.1)[MIN_COLUMNS]
+        make_run(rows, [requirement], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
     entries, _ = read_entries(find_campaigns([tmp_path]), tmp_path / "pages")
     row = next(row for row in requirement_rows(entries, shipped_requirements()) if row.requirement == "DIMES-VEL")
     assert [(cell.word, cell.basis.partition("; holds")[0]) for cell in row.all_cells] == [
@@ -154,9 +149,9 @@ def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_pat
 
 
 def test_report_on_other_requirements_is_not_that_of_the_campaign(make_run: MakeRun, tmp_path: Path) -> None:
-    directory = make_run(make_rows(24)[MIN_COLUMNS])
+    directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory, [{**VELOCITY, "probability": 0.1}])
-    assert not signature.is_own_report(directory, directory)
+    assert not report_file.is_own_report(directory, directory)
     (entry,), _ = read_entries([directory], tmp_path / "pages")
     assert entry.report.verdicts[0].probability == VELOCITY["probability"]
 
@@ -166,10 +161,10 @@ def test_reports_of_another_program_are_written_again(
 ) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory)
-    monkeypatch.setattr(signature, "hash_program", lambda: "another version")
-    assert not signature.is_own_report(directory, directory)
+    monkeypatch.setattr(report_file, "hash_program", lambda: "another version")
+    assert not report_file.is_own_report(directory, directory)
     write_site(tmp_path / "site", [directory])
-    assert signature.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
+    assert report_file.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
 
 
 def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:
@@ -245,7 +240,7 @@ def test_reports_of_others_are_written_again(
     make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A page with a script, or data with another verdict, never reach the site; the campaign's folder is unchanged."""
-    directory = make_run(make_rows(24)[MIN_COLUMNS], name="elsewhere")
+    directory = make_run(make_rows(12)[MIN_COLUMNS], name="elsewhere")
     own_page = write_report(directory).read_text(encoding="utf-8")
     _write_index(tmp_path)
     (page,) = (tmp_path / "site" / "c").glob("*/report.html")
@@ -261,10 +256,10 @@ def test_reports_of_others_are_written_again(
     write_report(directory)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     rows = directory / "cases.parquet"
-    write_table_with_seal(directory, make_rows(24, n_crashed=20)[MIN_COLUMNS])
+    write_table_with_seal(directory, make_rows(12, n_crashed=10)[MIN_COLUMNS])
     os.utime(rows, (0, 0))
     _write_index(tmp_path)
-    assert "20 cases crashed" in page.read_text(encoding="utf-8")
+    assert "10 cases crashed" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["report.html", "campaign.json", "cases/3/products.npz", "cases/7"])
@@ -315,7 +310,7 @@ def test_failed_requirements_precede_others(make_run: MakeRun, tmp_path: Path) -
         {**VELOCITY, "id": "UNDECIDED", "probability": 0.9999},
         {**VELOCITY, "id": "FAILED", "bound": 0.1},
     ]
-    make_run(make_rows(40, terrains=100_000), requirements)
+    make_run(make_rows(12)[MIN_COLUMNS], requirements)
     entries, _ = read_entries(find_campaigns([tmp_path]), tmp_path / "pages")
     rows = requirement_rows(entries, shipped_requirements())
     assert [row.requirement for row in rows[:3]] == ["FAILED", "UNDECIDED", "MET"]

@@ -31,13 +31,9 @@ from marsyard.reports.hda.sites_section import (
     site_fractions,
 )
 from marsyard.reports.rates import PooledRate, pooled_rate
-from marsyard.reports.section import Subject, drop_empty_columns
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.section import drop_empty_columns
 from tests.reports.hda.synthetic_landing import landing_frame
-
-
-def _make_subject(frame: pd.DataFrame) -> Subject:
-    return Subject(StoredRun(Path("nowhere"), frame, frame, {}, ()), None, None)
+from tests.reports.synthetic_run import make_subject
 
 
 def test_rates_pool_footprints_over_flights() -> None:
@@ -67,7 +63,7 @@ def test_rate_of_zero_has_no_bootstrap_interval() -> None:
 
 
 def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
-    section = run_times_section(_make_subject(landing_frame(20)))
+    section = run_times_section(make_subject(landing_frame(20)))
     assert section.data["cases"] == 20
     times = section.data["stages"]
     # Table 1 of the paper: 0.77 s in total
@@ -80,7 +76,7 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
 
 def test_touchdown_errors_are_compared_with_table_2() -> None:
     frame = landing_frame(200)
-    section = touchdown_section(_make_subject(frame))
+    section = touchdown_section(make_subject(frame))
     landings = frame[frame["landed"]]
     assert section.data["landings"] == len(landings)
     assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
@@ -90,7 +86,7 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
         "Fit, not validation: fitted to these data are averaging_after_s" in block.note for block in section.blocks
     )
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
-    assert touchdown_section(_make_subject(frame.assign(landed=False))) is None
+    assert touchdown_section(make_subject(frame.assign(landed=False))) is None
 
 
 def test_reported_sites_are_scored_against_the_truth() -> None:
@@ -163,12 +159,12 @@ def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
 
 def test_rates_are_reported_per_roughness_threshold() -> None:
     frame = landing_frame(40).assign(max_roughness_m=np.tile([0.1, 0.2], 20), false_alarms=np.tile([120, 30], 20))
-    section = threshold_section(_make_subject(frame))
+    section = threshold_section(make_subject(frame))
     low, high = section.data["thresholds"]
     assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
     assert (low["false_alarms"].fraction, high["false_alarms"].fraction) == (pytest.approx(0.2), pytest.approx(0.05))
     assert low["missed"].fraction == pytest.approx(8 / 400)
-    assert threshold_section(_make_subject(landing_frame(40))) is None
+    assert threshold_section(make_subject(landing_frame(40))) is None
 
 
 def test_faults_are_grouped_by_kind_and_size() -> None:
@@ -185,7 +181,7 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
     result_columns = ("safe", "refused", "unconverged", "wrong", "unfinished")
     assert all(sum(row[column] for column in result_columns) == row["n"] for row in rows)
     assert sum(row["wrong"] for row in rows) == (frame["site_reported"] & ~frame["site_safe"]).sum()
-    assert faults_section(_make_subject(landing_frame(20))) is None
+    assert faults_section(make_subject(landing_frame(20))) is None
 
 
 def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -> pd.DataFrame:
@@ -236,7 +232,7 @@ def test_map_errors_have_the_expected_rank_correlations() -> None:
     )
     frame["elevation_noise_m"] = 0.01 / frame["baseline_fraction"]
     frame["elevation_rms_m"] = np.abs(frame["range_error_m"])
-    mapped_rows = map_rows(_make_subject(frame))
+    mapped_rows = map_rows(make_subject(frame))
     assert mapped_rows is not None
     effects = {
         (effect.condition, effect.response): effect
@@ -254,7 +250,7 @@ def test_quantiles_and_correlations_need_20_maps(maps: int, has_statistics: bool
     rng = np.random.default_rng(4)
     columns = ("baseline_fraction", "texture", "elevation_noise_m", "elevation_rms_m", "slope_error_rms_deg")
     values = {name: rng.uniform(0.1, 1.0, maps) for name in columns}
-    section = map_section(_make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
+    section = map_section(make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
     errors, effects = section.blocks
     assert list(errors.grid.head[1:]) == (
         ["Minimum", "5 %", "Median", "95 %", "Maximum"] if has_statistics else ["Minimum", "Median", "Maximum"]
@@ -263,6 +259,7 @@ def test_quantiles_and_correlations_need_20_maps(maps: int, has_statistics: bool
     assert ("Lines are medians" in effects.figures[0].caption) == has_statistics
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_page_and_json_have_the_sections(make_run: Callable[..., Path]) -> None:
     directory = make_run(frame=landing_frame(40), requirements=[])
     page = write_report(directory)

@@ -24,8 +24,6 @@ from marsyard.reports.localisation.presentation import (
     view,
 )
 from marsyard.reports.presentation import find_case_kind, presentations, write_case_figures
-from marsyard.reports.section import Subject
-from marsyard.reports.stored import StoredRun
 from tests.reports.localisation.synthetic_localisation import (
     IMAGES,
     REFUSED,
@@ -33,6 +31,7 @@ from tests.reports.localisation.synthetic_localisation import (
     refused_products,
     synthetic_products,
 )
+from tests.reports.synthetic_run import make_subject
 
 REQUIREMENT = {
     "id": "LOC-FINAL", "statement": "The last position is within 40 m.", "metric": "position_error_m", "bound": 40.0,
@@ -44,10 +43,6 @@ REQUIREMENT = {
 def products() -> dict[str, Any]:
     """Return products of a synthetic descent; see `synthetic_products`."""
     return synthetic_products()
-
-
-def _make_subject(frame: pd.DataFrame) -> Subject:
-    return Subject(StoredRun(Path("nowhere"), frame, frame, {}, ()), "position_error_m", 40.0)
 
 
 def test_presentation_is_registered(products: dict[str, Any]) -> None:
@@ -168,7 +163,7 @@ def test_view_of_a_refused_descent_has_one_row() -> None:
 
 def test_position_section_has_rates_and_quantiles() -> None:
     frame = localisation_frame(200)
-    section = position_section(_make_subject(frame))
+    section = position_section(make_subject(frame))
     rates = section.data["rates"]
     assert rates["Last answer within 10 s is a position"].hits == frame["fixed_in_time"].sum()
     assert rates["Coarse position within 200 m"].hits == frame["fixed_in_time"].sum()
@@ -178,31 +173,32 @@ def test_position_section_has_rates_and_quantiles() -> None:
 
 
 def test_condition_section_is_created() -> None:
-    section = light_section(_make_subject(localisation_frame(200)))
+    section = light_section(make_subject(localisation_frame(200)))
     bins = section.data["by_condition"]
     assert sum(entry["n"] for entry in bins) == 200
     assert [entry["fixed_in_time"].hits for entry in bins] == [entry["answered"].hits for entry in bins]
 
 
 def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
-    section = position_section(_make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
+    section = position_section(make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
     assert section.data["rates"]["Coarse position within 200 m"].n == 0
 
 
 @pytest.mark.parametrize("section", [position_section, light_section])
 def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     """A campaign in which no descent has a position still reports that fact."""
-    created = section(_make_subject(localisation_frame(30, fixed_fraction=0.0)))
+    created = section(make_subject(localisation_frame(30, fixed_fraction=0.0)))
     assert created.blocks
 
 
 @pytest.mark.parametrize("section", [position_section, light_section])
 def test_other_campaigns_have_no_section(section: Any) -> None:
-    assert section(_make_subject(pd.DataFrame({"case": [0, 1], "sun_difference_deg": [1.0, 2.0]}))) is None
+    assert section(make_subject(pd.DataFrame({"case": [0, 1], "sun_difference_deg": [1.0, 2.0]}))) is None
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_page_and_json_have_the_sections(make_run: Callable[..., Path], products: dict[str, Any]) -> None:
-    directory = make_run(localisation_frame(40), [REQUIREMENT], products=products)
+    directory = make_run(localisation_frame(20), [REQUIREMENT], products=products)
     page = write_report(directory).read_text(encoding="utf-8")
     report = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     assert {"localisation", "localisation-conditions", "consistency"} <= set(report["sections"])

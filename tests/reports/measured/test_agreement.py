@@ -7,14 +7,13 @@ import pandas as pd
 
 from marsyard.reports.measured.presentation import MEASURED, agreement_section, read_matched_pairs
 from marsyard.reports.presentation import find_case_kind, write_case_figures
-from marsyard.reports.section import Subject
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.section import Section
+from tests.reports.synthetic_run import make_subject
 
 
-def make_subject(**columns: object) -> Subject:
-    """Return the subject of a report on four cases with these columns."""
-    frame = pd.DataFrame({"case": range(4), "outcome": ["VALID"] * 4, **columns})
-    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), None, None)
+def make_section(**columns: object) -> Section | None:
+    """Return the section on four cases with these columns."""
+    return agreement_section(make_subject(pd.DataFrame({"case": range(4), "outcome": ["VALID"] * 4, **columns})))
 
 
 def make_products(matches: int) -> dict[str, object]:
@@ -33,14 +32,12 @@ def make_products(matches: int) -> dict[str, object]:
 
 def test_section_reports_residuals_and_unmatched_cases() -> None:
     residuals = [0.4, np.nan, 0.6, 1.5]
-    section = agreement_section(
-        make_subject(
-            measured_case=["a", "b", "c", "d"],
-            residual_median_px=residuals,
-            residual_90_percent_px=[1.0, np.nan, 1.2, 3.0],
-            matches=[120, 3, 90, 80],
-            **{"mine.difference_m_s": [0.1, np.nan, 0.3, 0.2]},
-        )
+    section = make_section(
+        measured_case=["a", "b", "c", "d"],
+        residual_median_px=residuals,
+        residual_90_percent_px=[1.0, np.nan, 1.2, 3.0],
+        matches=[120, 3, 90, 80],
+        **{"mine.difference_m_s": [0.1, np.nan, 0.3, 0.2]},
     )
     assert (section.data["cases"], section.data["unmatched"]) == (4, 1)
     assert section.data["median_of_medians_px"] == 0.6
@@ -53,10 +50,8 @@ def test_section_reports_residuals_and_unmatched_cases() -> None:
 
 def test_infinite_residuals_are_not_missing_ones() -> None:
     """The poses of case b place the matches outside of the view of the later camera."""
-    section = agreement_section(
-        make_subject(
-            measured_case=list("abcd"), residual_median_px=[0.4, np.inf, 0.6, np.inf], matches=[120, 110, 9, 80]
-        )
+    section = make_section(
+        measured_case=list("abcd"), residual_median_px=[0.4, np.inf, 0.6, np.inf], matches=[120, 110, 9, 80]
     )
     (block,) = section.blocks
     assert [row[4] for row in block.grid.rows] == ["0.400", "out of view", "0.600", "out of view"]
@@ -65,7 +60,7 @@ def test_infinite_residuals_are_not_missing_ones() -> None:
 
 
 def test_no_section_without_recorded_cases() -> None:
-    assert agreement_section(make_subject(residual_median_px=[1.0] * 4)) is None
+    assert make_section(residual_median_px=[1.0] * 4) is None
 
 
 def test_case_without_matches_is_shown(tmp_path: Path) -> None:

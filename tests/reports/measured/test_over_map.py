@@ -7,30 +7,27 @@ import pandas as pd
 
 from marsyard.reports.measured.over_map import map_section
 from marsyard.reports.presentation import find_case_kind, write_case_figures
-from marsyard.reports.section import Subject
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.section import Section
+from tests.reports.synthetic_run import make_subject
 
 
-def make_subject(columns: dict[str, object]) -> Subject:
-    """Return the subject of a report on four images, of which the third has no pose."""
-    frame = pd.DataFrame({"case": range(4), "measured_case": list("abcd"), **columns})
-    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), None, None)
+def make_section(columns: dict[str, object]) -> Section | None:
+    """Return the section on four images, of which the third has no pose."""
+    return map_section(make_subject(pd.DataFrame({"case": range(4), "measured_case": list("abcd"), **columns})))
 
 
 def test_section_has_medians_of_images_with_a_pose() -> None:
     nan = np.nan
-    section = map_section(
-        make_subject(
-            {
-                "registration_inliers": [40, 60, 0, 80],
-                "height_m": [4000.0, 3000.0, nan, 2000.0],
-                "template_yield": [0.9, 0.8, nan, 1.0],
-                "rendered.registration_inliers": [90, 0, nan, 70],
-                "rendered.height_m": [4010.0, nan, nan, 2010.0],
-                "rendered.template_yield": [0.5, nan, nan, 0.7],
-                "rendered.pose_error_px": [0.2, nan, nan, 0.4],
-            }
-        )
+    section = make_section(
+        {
+            "registration_inliers": [40, 60, 0, 80],
+            "height_m": [4000.0, 3000.0, nan, 2000.0],
+            "template_yield": [0.9, 0.8, nan, 1.0],
+            "rendered.registration_inliers": [90, 0, nan, 70],
+            "rendered.height_m": [4010.0, nan, nan, 2010.0],
+            "rendered.template_yield": [0.5, nan, nan, 0.7],
+            "rendered.pose_error_px": [0.2, nan, nan, 0.4],
+        }
     )
     counts = [section.data[name] for name in ("images", "recorded_with_pose", "rendered", "rendered_with_pose")]
     assert counts == [4, 3, 3, 2]
@@ -47,7 +44,7 @@ def test_section_has_medians_of_images_with_a_pose() -> None:
 
 
 def test_other_recorded_images_have_no_section() -> None:
-    assert map_section(make_subject({"residual_median_px": [1.0] * 4})) is None
+    assert make_section({"residual_median_px": [1.0] * 4}) is None
 
 
 def test_figure_shows_image_and_map(tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def test_bounds_use_the_first_cases_of_each_terrain_if_all_cost_too_much(index: 
     assert evidence.counted == (None if selected.size == index.size else counted)
 
 
-@pytest.mark.parametrize("correlation", [0.02, 0.3])
+@pytest.mark.parametrize("correlation", [pytest.param(0.02, marks=pytest.mark.slow), 0.3])
 def test_bounds_of_many_cases_on_shared_terrains_cover_the_true_rate(correlation: float) -> None:
     rng, rate, trials = np.random.default_rng(8), 0.05, 1000
     index, n_missed = np.tile(np.arange(200), 60), np.zeros(2)

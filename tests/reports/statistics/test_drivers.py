@@ -35,7 +35,7 @@ def test_quadratic_driver_explains_variance_without_correlation() -> None:
     assert result.fraction_lower > 0.8
 
 
-@pytest.mark.parametrize("n", [60, 600])
+@pytest.mark.parametrize("n", [60, pytest.param(600, marks=pytest.mark.slow)])
 def test_intervals_of_an_unrelated_condition_contain_zero(n: int) -> None:
     # 200 samples: standard deviation of the coverage 2.1 % at 90 %, 1.5 % at 95 %
     rng = np.random.default_rng(3)

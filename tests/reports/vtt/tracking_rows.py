@@ -1,14 +1,13 @@
 """Synthetic rows and products of tracking cases."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from marsyard.reports.section import Block, Section, Subject
-from marsyard.reports.stored import StoredRun
+from tests.reports import synthetic_run
 
 
 def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
@@ -44,8 +43,8 @@ def make_subject(
 ) -> Subject:
     """Return the subject of a report on these rows, for a campaign with this name and these legs of the drive."""
     parameters = {"drive": {"legs": legs}} if legs else {}
-    record = {"name": name, "definition": {"parameters": parameters}}
-    return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
+    definition = {"parameters": parameters}
+    return synthetic_run.make_subject(frame, "position_error_m", 0.03, name=name, definition=definition)
 
 
 def set_values(frame: pd.DataFrame, index: int, **values: Any) -> None:
