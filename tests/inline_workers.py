@@ -47,10 +47,10 @@ def use_inline_workers(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"marsyard.campaigns.{name}", InlineExecutor)
 
 
-def inline_workers_fixture(scope: Any = "function") -> Any:
-    """Return an autouse fixture that replaces the worker processes in the tests of a module."""
+def inline_workers_fixture() -> Any:
+    """Return a fixture that replaces the worker processes in all tests of a module: ``_inline = ...()``."""
 
-    @pytest.fixture(autouse=True, scope=scope)
+    @pytest.fixture(autouse=True, scope="module")
     def inline_workers() -> Iterator[None]:
         with pytest.MonkeyPatch.context() as monkeypatch:
             use_inline_workers(monkeypatch)

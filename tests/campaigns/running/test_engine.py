@@ -63,6 +63,7 @@ def test_workers_have_one_thread_and_the_same_hash_seed(failing_campaign: Path) 
     assert len({row["hash_of_text"] for row in rows}) == 1
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     parameters = f"shared = 3\ncache = '{tmp_path}'"
     run(campaign_file(parameters), tmp_path / "run", watch, "cases=1", "retain.showcase=none")
@@ -70,6 +71,7 @@ def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: 
     assert watch.steps == {"preparing": 3, "cases": 1}
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_failed_shared_inputs_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     run(campaign_file("shared = 1\nfail_prepare = true"), tmp_path / "run", watch, "cases=1", jobs=1)
     note = "shared input 0 could not be prepared: OSError: the disk is full"
@@ -94,6 +96,7 @@ def test_used_folder_is_rejected(
         run(campaign_file(), tmp_path / "fake.toml" / "run", watch)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_unknown_metric_stops_the_campaign_after_one_case(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
@@ -124,6 +127,7 @@ def test_metrics_are_numbers_or_sums_or_true_or_false(campaign_file: CampaignFil
         check_metrics(definition, row, Path("runs"))
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_metric_exists_if_all_cases_crash(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     directory = run(campaign_file("raising_cases = [0, 1]"), tmp_path / "run", watch, "cases=2", jobs=1)
     frame = pd.read_parquet(directory / "cases.parquet")

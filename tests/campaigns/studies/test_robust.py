@@ -42,7 +42,9 @@ from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain import Site
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.limit_state import CAMPAIGN
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 #: Beta of the runs: 0.6 % of the cases fail, of at most 5 %.
 CAMPAIGN = CAMPAIGN.replace("cases = 100", "cases = 200").replace("probability = 0.99", "probability = 0.95")
 BETA = 2.5

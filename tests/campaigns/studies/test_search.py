@@ -25,7 +25,9 @@ from tests.campaigns.studies import limit_state
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.planted_defect import CAMPAIGN
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 campaign_path = campaign_fixture(CAMPAIGN)
 
 
