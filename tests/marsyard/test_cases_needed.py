@@ -8,6 +8,7 @@ import pytest
 
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
 from tests.command import marsyard
+from tests.inline_workers import inline_workers_fixture
 
 #: 99 % at 90 % confidence: 230 answers without a failure at one look, 297 if 24 answers were evaluated before.
 REQUIREMENT = """
@@ -23,6 +24,7 @@ population = "POPULATION"
 DISPERSIONS = '[dispersions]\nterrain = {distribution = "in-turn", low = 0, high = 99999}'
 
 
+_inline_workers = inline_workers_fixture()
 pytestmark = pytest.mark.usefixtures("_working_folder")
 
 

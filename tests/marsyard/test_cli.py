@@ -110,6 +110,7 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_dry_run_only_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
@@ -143,6 +144,7 @@ def _crashing_case_setting(case: int) -> str:
         ),
     ],
 )
+@pytest.mark.usefixtures("inline_workers")
 def test_exit_status_follows_verdict_and_crashes(
     tmp_path: Path, parameters: str, requirement: str, status: int, verdict: str
 ) -> None:
@@ -155,6 +157,7 @@ def test_exit_status_follows_verdict_and_crashes(
     assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
     invalid_requirement = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
     path = write_campaign(tmp_path, _crashing_case_setting(0), dispersions="", requirement=invalid_requirement)
