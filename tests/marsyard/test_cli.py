@@ -25,7 +25,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a small campaign with the installed command."""
     folder = tmp_path_factory.mktemp("campaign")
     path = write_campaign(folder, "unanswered_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
-    command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
+    command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "1", "-n", "6"]
     result = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
     assert result.returncode == 3, result.stderr
     (folder / "stdout.txt").write_text(result.stdout)

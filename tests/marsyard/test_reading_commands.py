@@ -107,6 +107,7 @@ def test_running_commands_refuse_code_from_elsewhere(
 
 def test_folder_from_elsewhere_runs_with_trusted_code_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
+    use_inline_workers(monkeypatch)
     estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
     (tmp_path / "trusted_estimator.py").write_text(estimator)
     (tmp_path / "fake.toml").write_text(

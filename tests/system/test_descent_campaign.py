@@ -65,7 +65,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arguments = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "1", "--out", "A"]
     subprocess_run = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=300)
     assert subprocess_run.returncode == EXIT_INSUFFICIENT, subprocess_run.stdout + subprocess_run.stderr
-    in_process_run = _run_marsyard("run", "small.toml", "--jobs", "2", "--out", "B", cwd=folder)
+    in_process_run = _run_marsyard(
+        "run", "small.toml", "--set", "retain.showcase=none", "--jobs", "2", "--out", "B", cwd=folder
+    )
     assert in_process_run.exit_code == EXIT_INSUFFICIENT, in_process_run.output
     for output in (subprocess_run.stdout, in_process_run.stdout):
         assert "INSUFFICIENT" in output
