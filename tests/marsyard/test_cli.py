@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ import pandas as pd
 import pytest
 
 from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS, write_campaign
+from tests.campaigns.killing import start_and_kill
 from tests.command import marsyard
 
 
@@ -71,23 +71,10 @@ def test_stages_are_saved_as_separate_files(finished_run: Path, tmp_path: Path) 
     assert f"stages: 3 files in {stages}" in result.out
 
 
-def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
-    """Run a campaign and kill it when the first rows are stored."""
-    command = [sys.executable, "-m", "marsyard", "run", str(path), "-n", str(cases), "--jobs", "1"]
-    command += ["--out", str(directory)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    log = directory / "cases.sqlite-wal"
-    # The write-ahead log of an empty table has two pages of 4.1 kB. A log of more than four pages contains rows.
-    while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
-
-
 @pytest.mark.slow
 def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
-    _kill_after_first_rows(path, tmp_path / "run", 40)
+    start_and_kill(["run", path, "-n", "40", "--jobs", "1"], tmp_path / "run")
     record_before = (tmp_path / "run" / "campaign.json").read_bytes()
     report_result = marsyard("report", tmp_path / "run")
     assert (report_result.status, report_result.err) == (3, "")
@@ -106,8 +93,8 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     append_result = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert append_result.status == 3
     assert "of 60" in append_result.out
-    # minimum number of cases for 99 % at 90 % confidence
-    assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
+    # minimum number of cases for 99 % at 90 % confidence, if 40 cases were evaluated before
+    assert "takes at least 297 cases without a failure; the campaign has 60" in append_result.out
 
 
 @pytest.mark.usefixtures("inline_workers")

@@ -19,7 +19,7 @@ from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
 from marsyard.campaigns.studies.results import BudgetParameters, RareParameters, RareResult, SearchParameters
 from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows, run
-from tests.campaigns.studies.killing import kill_and_resume
+from tests.campaigns.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 from tests.command import run_command
 from tests.inline_workers import inline_workers_fixture
