@@ -17,13 +17,14 @@ def run_suite(spec: str, *checks: str, task: str | None = None, limit_s: float =
     The algorithm is described in this process, which takes less time than the start of a process.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("marsyard.scenarios.custom_algorithms.describe_in_process", _describe_here)
+        patch.setattr("marsyard.scenarios.custom_algorithms.describe_in_process", describe_here)
         subject = Subject(spec, task or determine_task(spec), limit_s)
         names = [name for name, _ in list_checks(subject)]
         return {name: run_check(subject, names.index(name)) for name in (checks or names)}
 
 
-def _describe_here(spec: str) -> AlgorithmDescription:
+def describe_here(spec: str) -> AlgorithmDescription:
+    """Import an algorithm in this process, and describe it."""
     contents = describe_factory(import_object(spec))
     return AlgorithmDescription(**{**contents, "members": frozenset(contents["members"])})
 
