@@ -60,11 +60,10 @@ def _check_row_columns() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _describe_algorithms_here() -> Iterator[None]:
-    """Describe the algorithms of test modules in this process, except in the tests of processes."""
+    """Describe the algorithms of test modules in this process."""
 
     def describe(spec: str) -> AlgorithmDescription:
-        is_here = spec.startswith("tests.scenarios.") and not spec.startswith("tests.scenarios.isolation.")
-        return describe_here(spec) if is_here else describe_in_process(spec)
+        return describe_here(spec) if spec.startswith("tests.scenarios.") else describe_in_process(spec)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(custom_algorithms, "describe_in_process", describe)
