@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, run, write_campaign
-from tests.inline_workers import use_inline_workers
 
 
 @pytest.fixture
@@ -19,12 +18,6 @@ def campaign_file(tmp_path: Path) -> CampaignFile:
 def watch() -> RecordingWatch:
     """Return a progress watch that records stages, steps and notes of a run without printing."""
     return RecordingWatch()
-
-
-@pytest.fixture
-def inline_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run cases in the process of the test."""
-    use_inline_workers(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -1,17 +1,10 @@
-"""Fixtures of the tests of commands: cases in the process of the test, and repositories with confirmations."""
+"""Fixtures of the tests of commands: repositories with confirmations."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.inline_workers import use_inline_workers
 from tests.marsyard.confirmation_project import Command, confirm, copy_project, create_project, make_command
-
-
-@pytest.fixture
-def inline_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run cases in the process of the test."""
-    use_inline_workers(monkeypatch)
 
 
 @pytest.fixture
