@@ -24,10 +24,13 @@ from tests.campaigns.killing import kill_and_resume, start_program
 
 def _start_campaign(path: Path, directory: Path, **environment: str) -> subprocess.Popen[bytes]:
     """Run a campaign of 500 cases in a process; return the process as soon as rows are stored."""
-    arguments = ["run", path, "--jobs", "2", "--set", "sleep_s=0.2", "-n", "500"]
-    # processes started in the background ignore SIGINT by default
-    options = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
-    return start_program(arguments, directory, env={**os.environ, **environment}, **options)
+    return start_program(
+        ["run", path, "--jobs", "2", "--set", "sleep_s=0.2", "-n", "500"],
+        directory,
+        env={**os.environ, **environment},
+        # processes started in the background ignore SIGINT by default
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def _find_workers(process: subprocess.Popen[bytes]) -> list[int]:
