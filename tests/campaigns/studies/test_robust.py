@@ -358,6 +358,13 @@ def test_value_that_the_campaign_sets_by_a_dispersion_is_rejected(tmp_path: Path
     assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
 
 
+def test_nominal_case_is_not_repeated(tmp_path: Path) -> None:
+    """It is no random draw: the study has the 60 cases after it."""
+    run = run_text(tmp_path, f"{CAMPAIGN}\n[design]\nnominal = true\n", 61)
+    rows = read_case_rows(study(run, {"beta": 1.0}, cases=60))
+    assert {StudyPoint.read(row["standard_point"]).stream for row in rows} == set(range(1, 61))
+
+
 def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
     lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
     table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'
