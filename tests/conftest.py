@@ -101,3 +101,11 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"needs the real data in {SHARED_DATA}, which does not exist")
     return SHARED_DATA
+
+
+@pytest.fixture
+def inline_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the cases of campaigns in the process of the test."""
+    from tests.inline_workers import use_inline_workers
+
+    use_inline_workers(monkeypatch)

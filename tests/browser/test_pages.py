@@ -102,7 +102,6 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> Non
     assert "No such case" in page.locator(".explorer-detail").inner_text()
 
 
-@pytest.mark.slow
 def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     axis_select = page.locator(".explorer-canvas select").first
@@ -271,19 +270,8 @@ def test_percentiles_of_a_case_are_not_cut_off(campaigns: Path, open_page: OpenP
 
 
 # Layout depends on the width, contrast on the scheme: two of the four combinations cover both.
-@pytest.mark.parametrize(
-    ("page_kind", "width", "scheme"),
-    [
-        ("report", 1280, "dark"),
-        ("index", 390, "light"),
-        ("campaign", 1280, "dark"),
-        ("case", 390, "light"),
-        pytest.param("report", 390, "light", marks=pytest.mark.slow),
-        pytest.param("index", 1280, "dark", marks=pytest.mark.slow),
-        pytest.param("campaign", 390, "light", marks=pytest.mark.slow),
-        pytest.param("case", 1280, "dark", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "dark"), (390, "light")])
+@pytest.mark.parametrize("page_kind", ["report", "index", "campaign", "case"])
 def test_pages_are_accessible_and_fit_the_window(
     campaigns: Path, open_page: OpenPage, page_kind: str, width: int, scheme: str
 ) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from marsyard.campaigns.definition.evidence import Evidence
 from tests.command import Output, marsyard
+from tests.inline_workers import use_inline_workers
 
 #: The lower bound of 10 cases without failure is 0.1^(1/10) = 79 % at 90 % confidence: PASS.
 CAMPAIGN = """
@@ -76,7 +77,8 @@ def create_project(folder: Path) -> None:
 
 
 def make_command(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
-    """Return a function that runs the command line in a folder."""
+    """Return a function that runs the command line in a folder, with cases in the process of the test."""
+    use_inline_workers(monkeypatch)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
 

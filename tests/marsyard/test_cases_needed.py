@@ -8,6 +8,7 @@ import pytest
 
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
 from tests.command import marsyard
+from tests.inline_workers import inline_workers_fixture
 
 #: 99 % at 90 % confidence: 230 answers without a failure at one look, 297 if 24 answers were evaluated before.
 REQUIREMENT = """
@@ -23,6 +24,7 @@ population = "POPULATION"
 DISPERSIONS = '[dispersions]\nterrain = {distribution = "in-turn", low = 0, high = 99999}'
 
 
+_inline_workers = inline_workers_fixture()
 pytestmark = pytest.mark.usefixtures("_working_folder")
 
 
@@ -63,24 +65,18 @@ def test_printed_command_decides_the_campaign(
 
 
 @pytest.mark.slow
-def test_new_campaign_of_the_stated_size_is_decided(tmp_path: Path) -> None:
-    """The campaign with 230 cases has one look and needs fewer cases than the extended one."""
-    path = write_small_campaign(tmp_path, "all", range(0))
-    _, output, _ = marsyard("run", path, "--out", "run", "--jobs", 2)
-    (cases,) = re.findall(r"A new campaign with a new seed needs only \d+ cases \(-n (\d+)\)", output)
-    assert cases == "230"
-    assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
+@pytest.mark.parametrize(("terrains", "condition"), [("99999", ""), ("11", ", and a terrain for each case,")])
+def test_new_campaign_of_the_stated_size_is_decided(tmp_path: Path, terrains: str, condition: str) -> None:
+    """A campaign with 230 cases has one look and needs fewer cases than the extended one.
 
-
-@pytest.mark.slow
-def test_new_campaign_has_a_terrain_for_each_case(tmp_path: Path) -> None:
-    """Cases on shared terrains need more: a new campaign without shared terrains is named, and is decided."""
-    shared = DISPERSIONS.replace("99999", "11")
-    _, output, _ = marsyard("run", write_small_campaign(tmp_path, "all", range(0), shared), "--out", "run")
-    (cases,) = re.findall(r"with a new seed, and a terrain for each case, needs only \d+ cases \(-n (\d+)\)", output)
+    Cases on shared terrains need more: a new campaign without shared terrains is named.
+    """
+    path = write_small_campaign(tmp_path, "all", range(0), DISPERSIONS.replace("99999", terrains))
+    _, output, _ = marsyard("run", path, "--out", "run")
+    (cases,) = re.findall(rf"with a new seed{condition} needs only \d+ cases \(-n (\d+)\)", output)
     assert cases == "230"
     path = write_small_campaign(tmp_path, "all", range(0))
-    assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
+    assert marsyard("run", path, "-n", cases, "--seed", 6, "--out", "new")[0] == 0
 
 
 def test_campaign_with_a_failure_is_not_repeated(tmp_path: Path) -> None:

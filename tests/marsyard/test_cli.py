@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ import pandas as pd
 import pytest
 
 from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS, write_campaign
+from tests.campaigns.killing import start_and_kill
 from tests.command import marsyard
 
 
@@ -25,7 +25,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a small campaign with the installed command."""
     folder = tmp_path_factory.mktemp("campaign")
     path = write_campaign(folder, "unanswered_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
-    command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
+    command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "1", "-n", "6"]
     result = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
     assert result.returncode == 3, result.stderr
     (folder / "stdout.txt").write_text(result.stdout)
@@ -71,23 +71,10 @@ def test_stages_are_saved_as_separate_files(finished_run: Path, tmp_path: Path) 
     assert f"stages: 3 files in {stages}" in result.out
 
 
-def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
-    """Run a campaign and kill it when the first rows are stored."""
-    command = [sys.executable, "-m", "marsyard", "run", str(path), "-n", str(cases), "--jobs", "1"]
-    command += ["--out", str(directory)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    log = directory / "cases.sqlite-wal"
-    # The write-ahead log of an empty table has two pages of 4.1 kB. A log of more than four pages contains rows.
-    while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
-
-
 @pytest.mark.slow
 def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
-    _kill_after_first_rows(path, tmp_path / "run", 40)
+    start_and_kill(["run", path, "-n", "40", "--jobs", "1"], tmp_path / "run")
     record_before = (tmp_path / "run" / "campaign.json").read_bytes()
     report_result = marsyard("report", tmp_path / "run")
     assert (report_result.status, report_result.err) == (3, "")
@@ -106,10 +93,11 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     append_result = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert append_result.status == 3
     assert "of 60" in append_result.out
-    # minimum number of cases for 99 % at 90 % confidence
-    assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
+    # minimum number of cases for 99 % at 90 % confidence, if 40 cases were evaluated before
+    assert "takes at least 297 cases without a failure; the campaign has 60" in append_result.out
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_dry_run_only_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
@@ -143,6 +131,7 @@ def _crashing_case_setting(case: int) -> str:
         ),
     ],
 )
+@pytest.mark.usefixtures("inline_workers")
 def test_exit_status_follows_verdict_and_crashes(
     tmp_path: Path, parameters: str, requirement: str, status: int, verdict: str
 ) -> None:
@@ -155,6 +144,7 @@ def test_exit_status_follows_verdict_and_crashes(
     assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
     invalid_requirement = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
     path = write_campaign(tmp_path, _crashing_case_setting(0), dispersions="", requirement=invalid_requirement)
@@ -169,7 +159,6 @@ def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["run", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["run", "{folder}/none.toml"], "none.toml: no such file"),
         (["run", "{file}", "-n", "0"], "-n 0: cases: input should be greater than or equal to 1"),
-        (["run", "{file}", "-n", "x"], "Invalid value for '-n'"),
         (["run", "{file}", "--seed", "-1"], "--seed -1: seed: input should be greater than or equal to 0"),
         (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
         (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
@@ -185,16 +174,11 @@ def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["resume", "{folder}/none"], "none: no such folder"),
         (["resume", "{run}", "--retry", "crased"], "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all"),
         (["resume", "{run}", "--case-time", "-1"], "--case-time -1.0: input should be greater than 0"),
-        (["append", "{run}", "0"], "Invalid value for 'N'"),
         (["append", "{folder}", "3"], "does not contain a campaign"),
-        (["run"], "Missing argument"),
-        (["run", "{file}", "--job", "1"], "No such option"),
-        (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
         (["show", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["report", "{folder}/none"], "none: no such folder"),
         (["report", "{folder}"], "does not contain a campaign"),
         (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
-        (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
         (["replay", "{run}", "--", "-1"], "has no case -1; allowed: 0 to 5"),
         (["replay", "{folder}", "0"], "does not contain a campaign"),
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),

@@ -7,22 +7,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.reports.assurance.package import MANIFEST, hash_files
-from tests.marsyard.confirmation_project import (
-    BAD_LUCK,
-    RECORD,
-    Command,
-    commit_all,
-    confirm,
-    create_project,
-    make_command,
-)
-
-
-@pytest.fixture
-def marsyard(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Create a repository with a campaign of 10 cases, and return a function that runs the command line in it."""
-    create_project(tmp_path)
-    return make_command(monkeypatch, tmp_path)
+from tests.marsyard.confirmation_project import BAD_LUCK, RECORD, Command, commit_all, confirm
 
 
 def rehash(folder: Path) -> None:
@@ -31,10 +16,9 @@ def rehash(folder: Path) -> None:
 
 
 def test_record_of_confirmations_is_verified_without_its_repository(
-    marsyard: Command, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    confirmed: Command, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert marsyard("run", "fake.toml", "--confirm", "--jobs", 1, "--out", "run").status == 0
-    output = marsyard("assure", "run", "--out", "package")
+    output = confirmed("assure", "run-1", "--out", "package")
     assert (output.status, "fake: PASS, 10 cases" in output.out) == (0, True)
     # a registered confirmation shows that its cases are new; other defeaters remain
     assert "claim: supported, with open defeaters" in output.out
@@ -46,7 +30,7 @@ def test_record_of_confirmations_is_verified_without_its_repository(
     # elsewhere, without the repository and its record
     elsewhere = Path(shutil.copytree("package", tmp_path_factory.mktemp("elsewhere") / "package"))
     (tmp_path / RECORD).unlink()
-    assert marsyard("assure", "--verify", elsewhere).status == 0
+    assert confirmed("assure", "--verify", elsewhere).status == 0
     # one result is removed, or changed, with a new hash
     record = elsewhere / "runs/fake" / RECORD
     lines = record.read_text().splitlines(keepends=True)
@@ -56,7 +40,7 @@ def test_record_of_confirmations_is_verified_without_its_repository(
     ):
         record.write_text("".join(changed))
         rehash(elsewhere)
-        output = marsyard("assure", "--verify", elsewhere)
+        output = confirmed("assure", "--verify", elsewhere)
         assert output.status == 1
         assert named in output.out
 

@@ -26,6 +26,7 @@ from marsyard.campaigns.store.confirmations import (
 from marsyard.campaigns.store.git_history import find_registration_problem
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
 from marsyard.campaigns.store.table import write_table
+from marsyard.scenarios.interface import IdentifiesTerrains
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain.bank import TerrainBank
 from tests.marsyard.confirmation_project import (
@@ -36,22 +37,13 @@ from tests.marsyard.confirmation_project import (
     Command,
     commit_all,
     confirm,
-    create_project,
     git,
-    make_command,
     read_evidence,
     read_statuses,
 )
 
 SHIPPED_RECORD = Path(__file__).parents[2] / "benchmarks" / "results" / RECORD
 FAILING_CASES = "FAKE_FAILING_CASES"
-
-
-@pytest.fixture
-def marsyard(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Create a repository with a campaign of 10 cases, and return a function that runs the command line in it."""
-    create_project(tmp_path)
-    return make_command(monkeypatch, tmp_path)
 
 
 def test_run_on_a_seed_used_for_calibration_cannot_pass(marsyard: Command, tmp_path: Path) -> None:
@@ -63,17 +55,15 @@ def test_run_on_a_seed_used_for_calibration_cannot_pass(marsyard: Command, tmp_p
     assert read_evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
 
 
-def test_exploration_states_in_its_headline_that_it_is_no_confirmation(marsyard: Command, tmp_path: Path) -> None:
-    output = marsyard("run", "fake.toml", "--out", "run", "--jobs", 1)
-    assert (output.status, "verdict: PASS (exploration)" in output.out) == (0, True)
-    assert "evidence: Exploration" in output.out
-    assert json.loads((tmp_path / "run" / "report.json").read_text())["verdict"] == "PASS (exploration)"
-
-
-def test_changed_requirement_of_an_exploration_is_stated(marsyard: Command, tmp_path: Path) -> None:
+def test_exploration_states_that_it_is_no_confirmation_and_changed_requirements(
+    marsyard: Command, tmp_path: Path
+) -> None:
     changed = "The requirements are not those with which the campaign was started."
-    assert changed not in marsyard("run", "fake.toml", "--jobs", 1, "--out", "run").out
-    assert changed not in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
+    output = marsyard("run", "fake.toml", "--out", "run", "--jobs", 1)
+    assert (output.status, "verdict: PASS (exploration)" in output.out, changed in output.out) == (0, True, False)
+    assert "evidence: Exploration" in output.out
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert (report["verdict"], changed in report["evidence"]["text"]) == ("PASS (exploration)", False)
     _weaken_requirement(tmp_path / "run")
     assert changed in " ".join(marsyard("report", "run").out.split())
     assert changed in json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]["text"]
@@ -133,15 +123,14 @@ def test_unregistered_record_is_stated(marsyard: Command, tmp_path: Path) -> Non
 
 
 def test_record_is_found_after_it_moved_with_the_run(
-    marsyard: Command, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    confirmed: Command, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert confirm(marsyard, "run-1") == (0, ["PASS"])
     moved = tmp_path_factory.mktemp("elsewhere") / "project"
     shutil.copytree(tmp_path, moved)
     (tmp_path / RECORD).unlink()
-    assert marsyard("report", moved / "run-1").status == 0
+    assert confirmed("report", moved / "run-1").status == 0
     # a later result is added to the moved record
-    assert marsyard("append", moved / "run-1", 5, "--jobs", 1).status == 0
+    assert confirmed("append", moved / "run-1", 5, "--jobs", 1).status == 0
     assert read_record(moved / RECORD).confirmations[0].cases == 15
 
 
@@ -166,14 +155,13 @@ def test_verdict_without_its_record_is_no_pass(
     assert f"{tmp_path / RECORD} does not contain this run" in " ".join(output.text.split())
 
 
-def test_stopped_confirmation_is_repeated_with_the_same_cases(marsyard: Command, tmp_path: Path) -> None:
-    confirm(marsyard, "run-1")
+def test_stopped_confirmation_is_repeated_with_the_same_cases(confirmed: Command, tmp_path: Path) -> None:
     path = tmp_path / RECORD
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))  # as if the run had been killed
     assert read_record(path).confirmations[0].is_unfinished
-    output = marsyard("run", "fake.toml", "--confirm", "--out", "run-2", "-n", 9)
+    output = confirmed("run", "fake.toml", "--confirm", "--out", "run-2", "-n", 9)
     assert (output.status, "repeat it with all its cases: --confirm -n 10" in output.err) == (2, True)
-    assert confirm(marsyard, "run-3") == (0, ["PASS"])
+    assert confirm(confirmed, "run-3") == (0, ["PASS"])
     (entry,) = read_record(path).confirmations
     assert (entry.number, entry.is_unfinished) == (1, False)
     rows = [json.loads((tmp_path / name / "campaign.json").read_text())["seed"] for name in ("run-1", "run-3")]
@@ -181,36 +169,34 @@ def test_stopped_confirmation_is_repeated_with_the_same_cases(marsyard: Command,
 
 
 def test_appended_cases_are_announced_in_the_record(
-    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    confirmed: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    confirm(marsyard, "run-1")
     (tmp_path / "copy").mkdir()
     for name in ("campaign.json", "cases.parquet", "cases.sqlite"):
         (tmp_path / "copy" / name).write_bytes((tmp_path / "run-1" / name).read_bytes())
     monkeypatch.setenv(*BAD_LUCK)
-    assert marsyard("append", "run-1", 10, "--jobs", 1).status == 3
+    assert confirmed("append", "run-1", 10, "--jobs", 1).status == 3
     (entry,) = read_record(tmp_path / RECORD).confirmations
     assert (entry.cases, entry.counted_cases, entry.first_cases) == (20, 20, 10)
     (counts,) = entry.counts.values()
     assert counts["terrains"] == [[0, 0, 0, 0, 1, 0, 10], [1, 0, 0, 0, 0, 0, 10]]
     # a copy of the folder before the appended cases is not the confirmation
-    output = marsyard("report", "copy")
+    output = confirmed("report", "copy")
     reason = "The record announces 20 cases of confirmation 1; this folder contains 10."
     assert (output.status, reason in output.text) == (3, True)
 
 
-def test_changed_code_invalidates_a_confirmation(marsyard: Command, tmp_path: Path) -> None:
-    confirm(marsyard, "run-1")
+def test_changed_code_invalidates_a_confirmation(confirmed: Command, tmp_path: Path) -> None:
     path = tmp_path / "run-1" / "campaign.json"
     record = json.loads(path.read_text())
     record["changes"] = [{"utc": "", "cases_before": 3, "in": ["code (abc, now def)"]}]
     path.write_text(json.dumps(record))
-    output = marsyard("report", "run-1")
+    output = confirmed("report", "run-1")
     assert (output.status, "code (abc, now def)" in output.text) == (3, True)
     # also an exploration and a calibration
     for kind, title in (("exploration", "mixed programs"), ("calibration", "calibrated on these cases")):
         path.write_text(json.dumps(record | {"evidence": {"kind": kind}}))
-        output = marsyard("report", "run-1")
+        output = confirmed("report", "run-1")
         assert (output.status, "code (abc, now def)" in output.text) == (3, True)
         assert "code (abc, now def)" in (tmp_path / "run-1" / "report.html").read_text()
         report = json.loads((tmp_path / "run-1" / "report.json").read_text())
@@ -218,11 +204,10 @@ def test_changed_code_invalidates_a_confirmation(marsyard: Command, tmp_path: Pa
         assert "code (abc, now def)" in report["evidence"]["text"]
 
 
-def test_other_requirements_invalidate_a_confirmation(marsyard: Command, tmp_path: Path) -> None:
-    confirm(marsyard, "run-1")
+def test_other_requirements_invalidate_a_confirmation(confirmed: Command, tmp_path: Path) -> None:
     text = CAMPAIGN[CAMPAIGN.index("[[requirements]]") :].replace("0.75", "0.7")
     (tmp_path / "requirements.toml").write_text(text + 'campaigns = ["fake"]\n')
-    output = marsyard("report", "run-1", "--requirements", "requirements.toml")
+    output = confirmed("report", "run-1", "--requirements", "requirements.toml")
     assert (output.status, "requirements other than those of the campaign" in output.text) == (3, True)
 
 
@@ -255,23 +240,21 @@ def _replace_row(run: Path) -> None:
     ],
 )
 def test_folder_that_contradicts_the_record_is_no_confirmation(
-    marsyard: Command, tmp_path: Path, change: Callable[[Path], None], text: str
+    confirmed: Command, tmp_path: Path, change: Callable[[Path], None], text: str
 ) -> None:
-    assert confirm(marsyard, "run-1") == (0, ["PASS"])
     record = (tmp_path / RECORD).read_bytes()
     change(tmp_path / "run-1")
-    output = marsyard("report", "run-1")
+    output = confirmed("report", "run-1")
     assert (output.status, "Not the frozen evaluation: " in output.text, text in output.text) == (3, True, True)
     assert (tmp_path / RECORD).read_bytes() == record
 
 
-def test_repeated_cases_are_announced_and_their_results_recorded(marsyard: Command, tmp_path: Path) -> None:
+def test_repeated_cases_are_announced_and_their_results_recorded(confirmed: Command, tmp_path: Path) -> None:
     """`marsyard resume --retry` replaces rows: the record then expects another result."""
-    confirm(marsyard, "run-1")
     extend_confirmation(read_evidence(tmp_path / "run-1"), 10, repeats=True)
     assert read_record(tmp_path / RECORD).confirmations[0].is_unfinished
     _replace_row(tmp_path / "run-1")
-    output = marsyard("report", "run-1")
+    output = confirmed("report", "run-1")
     assert (output.status, "Not the frozen evaluation" in output.text) == (3, False)
     (entry,) = read_record(tmp_path / RECORD).confirmations
     assert (entry.is_unfinished, [counts["failures"] for counts in entry.counts.values()]) == (False, [1])
@@ -284,7 +267,7 @@ def test_campaigns_of_the_catalogue_are_no_copies_of_each_other(tmp_path: Path) 
     copy.write_text(file.read_text().replace('"dimes-smoke"', '"copy"').replace("high = 3.0", "high = 3.0001"))
     entries = []
     for name in ("dimes-smoke", "dimes-gusev", "hda-benign", str(copy)):
-        campaign = load_campaign(name)
+        campaign = load_campaign(name, cases=24)
         path = tmp_path / RECORD
         reserve_confirmation(select_confirmation_seed(replace(campaign, confirmations=path)), tmp_path)
         entries.append(read_record(path).confirmations[-1])
@@ -292,7 +275,7 @@ def test_campaigns_of_the_catalogue_are_no_copies_of_each_other(tmp_path: Path) 
     smoke, gusev, benign, changed = entries
     assert (is_variant(smoke, gusev), is_variant(changed, smoke)) == (False, False)
     assert [is_variant(entry, changed) for entry in (smoke, gusev, benign)] == [True, True, False]
-    changed_option = load_campaign("dimes-smoke", ["algorithm=dimes-plus", "dimes.min_peak=0.9"])
+    changed_option = load_campaign("dimes-smoke", ["algorithm=dimes-plus", "dimes.min_peak=0.9"], cases=24)
     reserve_confirmation(select_confirmation_seed(replace(changed_option, confirmations=path)), tmp_path)
     assert not read_record(path).confirmations[-1].is_included
 
@@ -355,11 +338,6 @@ def test_record_in_a_shallow_clone_is_unregistered(marsyard: Command, tmp_path: 
 @pytest.mark.parametrize("name", ["dimes-smoke", "hda-benign", "vtt-montecarlo", "loc-smoke"])
 def test_confirmations_of_each_system_use_other_terrains_than_the_campaign(name: str, tmp_path: Path) -> None:
     """A new seed of the bank gives every terrain of a case another identity; the record contains the seed."""
-    from dataclasses import replace
-
-    from marsyard.campaigns.store.confirmations import select_confirmation_seed
-    from marsyard.scenarios.interface import IdentifiesTerrains
-
     campaign = replace(load_campaign(name, cases=8), confirmations=tmp_path / RECORD)
     confirmation = select_confirmation_seed(campaign)
     identities = []

@@ -12,6 +12,7 @@ import pytest
 
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.command import marsyard
+from tests.inline_workers import use_inline_workers
 
 #: A module that leaves a file when it is imported, or an object of it is constructed.
 TRAP = """
@@ -41,17 +42,26 @@ class Trap:
 pytestmark = pytest.mark.usefixtures("_own_folder")
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run a campaign as the user whose state is next to its folder."""
+    folder = tmp_path_factory.mktemp("original")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(folder / "state"))
+        use_inline_workers(patch)
+        return run(write_campaign(folder), folder / "run", RecordingWatch())
+
+
 @pytest.fixture
-def _own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def _own_folder(original: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(original.parent / "state"))
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> dict[str, Path]:
+def folders(original: Path, tmp_path: Path) -> dict[str, Path]:
     """Folders of campaigns that name code which leaves a file when it is executed, by scenario."""
-    original = run(write_campaign(tmp_path, "products = 'good'"), tmp_path / "original", RecordingWatch(), jobs=1)
     (tmp_path / "trap.py").write_text(TRAP)
     (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap()))
     (tmp_path / "trap.sh").write_text("#!/bin/sh\ntouch executed\n")
@@ -65,7 +75,6 @@ def folders(tmp_path: Path) -> dict[str, Path]:
         for entry in record["algorithms"]:
             entry |= {"spec": "trap:Estimator", "path": "trap:Estimator"}
         (folders[scenario] / "campaign.json").write_text(json.dumps(record))
-    shutil.rmtree(original)
     return folders
 
 
@@ -98,6 +107,7 @@ def test_running_commands_refuse_code_from_elsewhere(
 
 def test_folder_from_elsewhere_runs_with_trusted_code_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
+    use_inline_workers(monkeypatch)
     estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
     (tmp_path / "trusted_estimator.py").write_text(estimator)
     (tmp_path / "fake.toml").write_text(

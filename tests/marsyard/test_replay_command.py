@@ -16,7 +16,9 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from tests.campaigns.fake_campaign import RecordingWatch, run, sign_folder, write_campaign
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 SCENARIO = """
 from tests.campaigns.fake_scenario import FakeScenario
 

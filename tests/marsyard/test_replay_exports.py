@@ -13,7 +13,10 @@ from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.campaigns.fake_scenario import FakeParameters, FakeScenario
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
 from tests.reports.timeline.timeline_example import make_timeline
+
+_inline_workers = inline_workers_fixture()
 
 
 class ScenarioWithTimeline(FakeScenario):

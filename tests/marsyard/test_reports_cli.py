@@ -5,8 +5,6 @@ Exit status: 0 requirements met, 1 failed, 2 error, 3 no verdict.
 
 import json
 import shutil
-import threading
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.campaign import run_until_decided
-from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.gallery import gallery_candidates
@@ -93,8 +90,7 @@ def test_two_campaigns_are_compared(make_run: MakeRun) -> None:
     assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
 
-@pytest.mark.slow
-def test_dashboard_is_written_and_served_locally(make_run: MakeRun, tmp_path: Path) -> None:
+def test_dashboard_is_written(make_run: MakeRun, tmp_path: Path) -> None:
     make_run("run")
     status, out, _ = marsyard("dashboard", tmp_path, "--out", tmp_path / "site")
     assert (status, "campaigns: 1" in out) == (0, True)
@@ -105,13 +101,7 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, tmp_path: Pa
     status, out, err = marsyard("dashboard", tmp_path, "--out", tmp_path / "site")
     assert (status, "campaigns: 1" in out, f"not shown: {broken}" in err) == (1, True, True)
     assert marsyard("dashboard", tmp_path / "none")[0] == 2
-    with create_server(tmp_path / "site", "127.0.0.1", 0) as http_server:
-        assert http_server.server_address[0] == "127.0.0.1"
-        threading.Thread(target=http_server.serve_forever, daemon=True).start()
-        root = f"http://127.0.0.1:{http_server.server_port}"
-        with urllib.request.urlopen(f"{root}/") as answer:  # noqa: S310
-            assert "Requirements and campaigns" in answer.read().decode()
-        http_server.shutdown()
+    assert "Requirements and campaigns" in (tmp_path / "site" / "index.html").read_text()
 
 
 def _make_rows(n: int, failures: int) -> pd.DataFrame:

@@ -1,15 +1,18 @@
-"""Check in all scenario tests that rows contain only the columns that the scenario declares, with their types."""
+"""Fixtures of all scenario tests: rows contain only the declared columns; algorithms of tests are described here."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
+from marsyard.scenarios import custom_algorithms
 from marsyard.scenarios.columns import ENGINE, Columns
 from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.isolation.remote import AlgorithmDescription, describe_in_process
 from marsyard.scenarios.systems import scenario_paths
+from tests.scenarios.suites import describe_here
 
 
 def _list_undeclared_columns(row: Any, declared_columns: Columns, custom_prefixes: tuple[str, ...]) -> list[str]:
@@ -52,4 +55,16 @@ def _check_row_columns() -> Iterator[None]:
             declared_columns = row_columns(name)
             assert declared_columns is not None
             patch.setattr(scenario_class, "run", add_column_check(scenario_class.run, declared_columns))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _describe_algorithms_here() -> Iterator[None]:
+    """Describe the algorithms of test modules in this process."""
+
+    def describe(spec: str) -> AlgorithmDescription:
+        return describe_here(spec) if spec.startswith("tests.scenarios.") else describe_in_process(spec)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(custom_algorithms, "describe_in_process", describe)
         yield

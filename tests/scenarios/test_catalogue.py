@@ -8,70 +8,9 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
-from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.definition.requirements import shipped_requirements
-from marsyard.campaigns.running.engine import check_metrics
-from marsyard.campaigns.store.rows import Row
-from marsyard.scenarios.rover.shared_drive import SharedDriveScenario
-from marsyard.scenarios.rover.shared_drive_parameters import SharedDriveParameters
-from marsyard.scenarios.systems import catalogue, systems
-from marsyard.sim.streams import Streams
-
-
-def _run_small_case(scenario: str) -> Row:
-    """Return the row of a small case of a scenario."""
-    if scenario == "rover-drive":
-        result = SharedDriveScenario().run(_make_short_drive(), Streams(1, "catalogue", 0))
-    else:
-        small_campaigns = {
-            load_campaign(name, overrides).definition.scenario: (name, overrides)
-            for system in systems()
-            for name, overrides in system.compilation_campaigns.items()
-        }
-        # The field test has no small campaign: its first case is run.
-        campaign = load_campaign(*small_campaigns.get(scenario, ("dimes-fieldtest", ())))
-        result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
-    return {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
-
-
-def _make_short_drive() -> SharedDriveParameters:
-    """Return a drive of one step with the step ranges of all campaigns, because each is a column."""
-    range_names = {
-        step_range["name"]
-        for campaign in _list_campaigns("rover-drive")
-        for step_range in _read_parameters(campaign)["step_ranges"]
-    }
-    return SharedDriveParameters.model_validate(
-        {
-            "drive": {
-                "world": {"samples": 512, "bank": 1},
-                "start": {"distance_m": 3.6},
-                "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}],
-            },
-            "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
-            "targets": [{"across": 0.0, "up": 0.5}],
-            "step_ranges": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(range_names)],
-        }
-    )
-
-
-def _read_parameters(campaign: str) -> dict[str, list[dict[str, str]]]:
-    return dict(load_campaign(campaign).definition.parameters)
-
-
-def _list_campaigns(scenario: str) -> list[str]:
-    return [name for name in catalogue() if load_campaign(name).definition.scenario == scenario]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "scenario", ["descent", pytest.param("fieldtest", marks=pytest.mark.slow), "rover", "rover-drive", "landing"]
-)
-def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
-    row = _run_small_case(scenario)
-    for name in _list_campaigns(scenario):
-        check_metrics(load_campaign(name).definition, row, Path(name))
-
+from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.definition.requirements import select_applicable, shipped_requirements
+from marsyard.scenarios.systems import catalogue
 
 #: Columns that are true only for an answer, or that contain a number only for one.
 AVAILABILITY = {
@@ -82,26 +21,29 @@ AVAILABILITY = {
 ANSWER_FLAGS = {"valid", "site_reported", "descent_target_exists", "fixed_in_time", "position_reported", "answered"}
 
 
-def read_campaign_requirements(name: str) -> tuple[Requirement, ...]:
-    return tuple(load_campaign(name).definition.requirements)
-
-
 def has_all_answers(requirement: Requirement) -> bool:
     """Whether the population contains the cases without an answer."""
     return not set(requirement.population.split(" and ")) & ANSWER_FLAGS
 
 
-@pytest.mark.parametrize("name", list(catalogue()))
-def test_each_campaign_requires_answers(name: str) -> None:
-    """Without such a requirement an algorithm that refuses every answer fails none."""
-    requirements = read_campaign_requirements(name)
-    assert requirements
-    assert any(entry.metric in AVAILABILITY and has_all_answers(entry) for entry in requirements)
-
-
-@pytest.mark.parametrize("name", list(catalogue()))
-def test_no_verdict_depends_on_the_run_time_of_the_host(name: str) -> None:
-    for requirement in read_campaign_requirements(name):
+@pytest.mark.parametrize(("name", "path"), catalogue().items(), ids=list(catalogue()))
+def test_shipped_campaign_has_sources_and_the_applicable_requirements(name: str, path: Path) -> None:
+    """The requirements' lists of campaigns agree with the campaigns' lists of requirements."""
+    assert find_campaign(name) == path
+    definition, shipped = load_campaign(name).definition, shipped_requirements()
+    assert definition.name == name
+    assert [key for key, dispersion in definition.dispersions.items() if not dispersion.source] == []
+    requirements = [entry for entry in definition.requirements if entry.id in shipped]
+    assert {entry.id for entry in requirements} == {
+        entry["id"] for entry in select_applicable(list(shipped.values()), name)
+    }
+    for requirement in requirements:
+        entry = shipped[requirement.id]
+        assert (requirement.metric, requirement.bound, requirement.kind) == (entry.metric, entry.bound, entry.kind)
+    # without such a requirement an algorithm that refuses every answer fails none
+    assert any(entry.metric in AVAILABILITY and has_all_answers(entry) for entry in definition.requirements)
+    # no verdict depends on the run time of the host
+    for requirement in definition.requirements:
         columns = f"{requirement.metric} {requirement.population}".split()
         assert not [column for column in columns if re.search(r"_time(_max|_median)?_s$|measured", column)]
 
@@ -117,7 +59,7 @@ def test_disparity_errors_of_table_1_are_normal_with_a_three_sigma_error_of_1_px
 
 def test_bounds_of_table_1_are_the_three_sigma_errors_of_the_paper() -> None:
     """The last column of Table I for a drift of 2.5 px, in cm; 3 sigma of a normal distribution are 99.73 %."""
-    requirements = {entry.id: entry for entry in read_campaign_requirements("vtt-accuracy")}
+    requirements = {entry.id: entry for entry in load_campaign("vtt-accuracy").definition.requirements}
     for name, stereo_cm, drift_cm_px in (("VTT-NAVCAM", 1.6, 0.16), ("VTT-PANCAM", 0.4, 0.06)):
         error_cm = math.hypot(stereo_cm, 2.5 * drift_cm_px)
         assert requirements[name].bound == pytest.approx(0.01 * error_cm, rel=0.01)

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes.baselines import HomographyEstimator
 from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, ExecutableTargetTracker
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -24,6 +24,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection, check_algorithms
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar
 from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
@@ -42,6 +43,14 @@ def test_algorithm_is_imported_from_the_current_folder(tmp_path: Path, monkeypat
     assert type(VELOCITY.make("local_algorithm:Mine", DimesOptions(), LIMITS)).__name__ == "Mine"
     with pytest.raises(ValueError, match="target tracker: missing members: designate, aim, update, clear, state"):
         TRACKING.check("local_algorithm:Mine")
+
+
+def test_sources_are_those_of_the_package() -> None:
+    path = "marsyard.algorithms.dimes:DimesEstimator"
+    assert import_object(path) is DimesEstimator
+    names = [name for name, _ in source_files(path)]
+    assert "algorithms/dimes/estimator.py" in names
+    assert {name.partition("/")[0] for name in names} == {"algorithms"}
 
 
 def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

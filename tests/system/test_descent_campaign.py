@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from marsyard.cli.app import app
+from tests.inline_workers import use_inline_workers
 
 #: Exit code of a campaign with too few cases for a verdict.
 EXIT_INSUFFICIENT = 3
@@ -46,7 +47,9 @@ population = "valid"
 
 
 def _run_marsyard(*arguments: str, cwd: Path) -> Result:
+    """Run a command with its cases in the process of the tests."""
     with pytest.MonkeyPatch.context() as patch:
+        use_inline_workers(patch)
         patch.chdir(cwd)
         patch.setattr(sys, "path", [*sys.path])  # Commands add the folder to the path; the context restores it.
         return CliRunner().invoke(app, arguments)
@@ -54,7 +57,7 @@ def _run_marsyard(*arguments: str, cwd: Path) -> Result:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run the campaign with one worker (folder A) and with two workers (folder B)."""
+    """Run the campaign as a program with two workers (folder A), and in the process of the tests (folder B)."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "small.toml").write_text(CAMPAIGN)
     # Marsyard must not import user modules that have the names of its packages.
@@ -62,10 +65,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("reports", "tests"):
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text("raise ImportError('the wrong module')\n")
-    arguments = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "1", "--out", "A"]
+    arguments = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "2", "--out", "A"]
     subprocess_run = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=300)
     assert subprocess_run.returncode == EXIT_INSUFFICIENT, subprocess_run.stdout + subprocess_run.stderr
-    in_process_run = _run_marsyard("run", "small.toml", "--jobs", "2", "--out", "B", cwd=folder)
+    in_process_run = _run_marsyard("run", "small.toml", "--set", "retain.showcase=none", "--out", "B", cwd=folder)
     assert in_process_run.exit_code == EXIT_INSUFFICIENT, in_process_run.output
     for output in (subprocess_run.stdout, in_process_run.stdout):
         assert "INSUFFICIENT" in output
@@ -78,11 +81,11 @@ def _read_rows(folder: Path) -> pd.DataFrame:
     return rows[[name for name in rows.columns if "time" not in name]]
 
 
-def test_rows_do_not_depend_on_the_number_of_workers(runs: Path) -> None:
-    rows_of_one_worker, rows_of_two_workers = _read_rows(runs / "A"), _read_rows(runs / "B")
-    pd.testing.assert_frame_equal(rows_of_one_worker, rows_of_two_workers, check_exact=True)
-    assert rows_of_one_worker["case"].tolist() == [0, 1, 2]
-    assert rows_of_one_worker["image_hash"].nunique() == 3
+def test_rows_do_not_depend_on_the_process(runs: Path) -> None:
+    rows_of_workers, rows_of_this_process = _read_rows(runs / "A"), _read_rows(runs / "B")
+    pd.testing.assert_frame_equal(rows_of_workers, rows_of_this_process, check_exact=True)
+    assert rows_of_workers["case"].tolist() == [0, 1, 2]
+    assert rows_of_workers["image_hash"].nunique() == 3
 
 
 def test_dispersed_values_are_simulated(runs: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
-from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import DefinitionError
@@ -35,21 +35,6 @@ def test_shipped_requirements_have_a_source() -> None:
 def test_campaigns_of_requirements_exist() -> None:
     patterns = [pattern for requirement in shipped_requirements().values() for pattern in requirement.campaigns]
     assert set(patterns) <= set(catalogue())
-
-
-@pytest.mark.parametrize(("name", "path"), catalogue().items(), ids=list(catalogue()))
-def test_shipped_campaign_has_sources_and_the_applicable_requirements(name: str, path: Path) -> None:
-    """The requirements' lists of campaigns agree with the campaigns' lists of requirements."""
-    assert find_campaign(name) == path
-    definition, shipped = load_campaign(name).definition, shipped_requirements()
-    assert definition.name == name
-    assert [key for key, dispersion in definition.dispersions.items() if not dispersion.source] == []
-    requirements = [entry for entry in definition.requirements if entry.id in shipped]
-    applicable = {entry["id"] for entry in select_applicable(list(shipped.values()), name)}
-    assert {requirement.id for requirement in requirements} == applicable
-    for requirement in requirements:
-        entry = shipped[requirement.id]
-        assert (requirement.metric, requirement.bound, requirement.kind) == (entry.metric, entry.bound, entry.kind)
 
 
 def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:

@@ -41,12 +41,6 @@ def raise_or_exit(item: int) -> object:
     return lambda: item
 
 
-@pytest.mark.slow
-def test_number_of_worker_processes_is_respected() -> None:
-    assert set(list_results(run_items(get_process_id, range(5))).values()) != {os.getpid()}
-    assert len(set(list_results(run_items(get_process_id, range(20), jobs=2)).values())) == 2
-
-
 def test_task_of_killed_worker_is_repeated(tmp_path: Path) -> None:
     results = run_items(partial(abort_once, str(tmp_path / "marker")), range(6), jobs=2)
     assert list_results(results) == {item: item for item in range(6)}

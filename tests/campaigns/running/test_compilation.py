@@ -1,30 +1,17 @@
 """Tests of the compilation of kernels, before the first case of a campaign and by `marsyard compile`."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.running import compilation
 from marsyard.campaigns.running.compilation import compile_kernels, list_compilations
 from marsyard.scenarios.systems import scenario_names, systems
 from marsyard.sim.kernel_cache import mark_ready
 from tests.command import run_command
-
-
-class InlineExecutor:
-    """An executor that runs tasks in this process."""
-
-    def run(self, work: Work[Any]) -> Iterator[list[TaskResult[Any]]]:
-        for item in work.items:
-            try:
-                yield [TaskResult(item, work.task(item), None)]
-            except RuntimeError as error:
-                yield [TaskResult(item, None, error)]
+from tests.inline_workers import InlineExecutor
 
 
 def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,6 +41,7 @@ def test_invalid_evidence_in_a_record_is_an_exploration(entry: object) -> None:
     assert Evidence.read(entry) == Evidence()
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_run_killed_at_its_start_can_be_restarted(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:

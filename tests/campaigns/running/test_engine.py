@@ -23,7 +23,7 @@ def test_campaign_with_failing_cases_finishes(
     rows = read_case_rows(failing_campaign)
     assert [row["case"] for row in rows] == list(range(12))
     outcomes = [row["outcome"] for row in rows]
-    assert [case for case, outcome in enumerate(outcomes) if outcome == "CRASHED"] == [3, 5, 6]
+    assert [case for case, outcome in enumerate(outcomes) if outcome == "CRASHED"] == [3, 5]
     assert outcomes[2] == "SILENT"
     assert not rows[2]["answered"]
     assert rows[3]["error"] == "ZeroDivisionError: case 3 of <object object at 0x...>"
@@ -34,9 +34,9 @@ def test_campaign_with_failing_cases_finishes(
     single_worker_rows = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch))
     assert [differing_columns(*pair) for pair in zip(rows, single_worker_rows, strict=True)] == [()] * 12
     rows_without_faults = read_case_rows(run(campaign_file("unanswered_cases = [2]"), tmp_path / "no-faults", watch))
-    for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
+    for case in (0, 1, 2, 4, 6, 7, 8, 9, 10, 11):
         assert differing_columns(rows[case], rows_without_faults[case]) == ()
-    for case in (3, 5, 7):
+    for case in (5, 7):
         replay_result = replay(failing_campaign, case)
         assert replay_result.stored is not None
         assert replay_result.differing == ()
@@ -46,7 +46,7 @@ def test_campaign_with_failing_cases_finishes(
 def test_record_describes_the_run(failing_campaign: Path) -> None:
     stored_record = record.read(failing_campaign)
     assert (stored_record["schema"], stored_record["state"], stored_record["exit_code"]) == (1, "finished", None)
-    assert (stored_record["cases_finished"], stored_record["cases_crashed"], stored_record["seed"]) == (12, 3, 5)
+    assert (stored_record["cases_finished"], stored_record["cases_crashed"], stored_record["seed"]) == (12, 2, 5)
     assert stored_record["definition"]["parameters"]["lowest_altitude_m"] == 0.0
     assert stored_record["definition"]["dispersions"]["wind.east_m_s"]["source"] == "test"
     assert stored_record["requirements"][0]["population"] == "all"
@@ -63,6 +63,7 @@ def test_workers_have_one_thread_and_the_same_hash_seed(failing_campaign: Path) 
     assert len({row["hash_of_text"] for row in rows}) == 1
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     parameters = f"shared = 3\ncache = '{tmp_path}'"
     run(campaign_file(parameters), tmp_path / "run", watch, "cases=1", "retain.showcase=none")
@@ -70,6 +71,7 @@ def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: 
     assert watch.steps == {"preparing": 3, "cases": 1}
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_failed_shared_inputs_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     run(campaign_file("shared = 1\nfail_prepare = true"), tmp_path / "run", watch, "cases=1", jobs=1)
     note = "shared input 0 could not be prepared: OSError: the disk is full"
@@ -94,6 +96,7 @@ def test_used_folder_is_rejected(
         run(campaign_file(), tmp_path / "fake.toml" / "run", watch)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_unknown_metric_stops_the_campaign_after_one_case(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
@@ -124,6 +127,7 @@ def test_metrics_are_numbers_or_sums_or_true_or_false(campaign_file: CampaignFil
         check_metrics(definition, row, Path("runs"))
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_metric_exists_if_all_cases_crash(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     directory = run(campaign_file("raising_cases = [0, 1]"), tmp_path / "run", watch, "cases=2", jobs=1)
     frame = pd.read_parquet(directory / "cases.parquet")

@@ -28,7 +28,9 @@ from tests.campaigns.fake_campaign import (
     read_case_rows,
     run,
 )
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 DISPERSION = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 5}'
 
 

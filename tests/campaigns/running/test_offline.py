@@ -22,7 +22,9 @@ from marsyard.campaigns.running.export_scoring import (
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.sim.measurements import DescentMeasurements
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 N_CASES = 3
 CAMPAIGN = f"""
 name = "fake-velocity"

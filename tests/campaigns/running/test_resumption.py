@@ -89,6 +89,7 @@ def test_crashed_cases_are_repeated_on_request(finished_campaign: Path, watch: R
     assert [row["case_attempts"] for row in read_case_rows(finished_campaign)] == [1, 1, 3, 1]
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_changed_versions_are_rejected_without_allow_changed(
     finished_campaign: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +118,7 @@ def test_changed_definition_is_rejected(finished_campaign: Path, watch: Recordin
         check_rows(finished_campaign)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_store_of_another_campaign_is_rejected(
     finished_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:

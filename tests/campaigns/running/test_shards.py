@@ -17,8 +17,11 @@ from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.running.shards import Shard, merge_shards
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
-from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, write_campaign
+from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, write_campaign
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
+
+_inline_workers = inline_workers_fixture()
 
 
 def _run_shards(path: Path, folder: Path, count: int, overrides: Sequence[str] = ()) -> list[Path]:
@@ -32,10 +35,17 @@ def _run_shards(path: Path, folder: Path, count: int, overrides: Sequence[str] =
 
 
 @pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Run the failing campaign in four shards. Tests must not change the folders."""
-    folder = tmp_path_factory.mktemp("shards")
-    return _run_shards(write_campaign(folder, FAILING_CASES), folder, 4)
+def whole_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run a campaign with a case that raises, and one without an answer. Tests must not change the folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    path = write_campaign(folder, "raising_cases = [3]\nunanswered_cases = [2]")
+    return run(path, folder / "run", RecordingWatch())
+
+
+@pytest.fixture(scope="module")
+def shards(whole_run: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Run the same campaign in four shards. Tests must not change the folders."""
+    return _run_shards(whole_run.parent / "fake.toml", tmp_path_factory.mktemp("shards"), 4)
 
 
 @pytest.mark.parametrize(("total", "count"), [(12, 4), (10, 3), (3, 5), (1000, 7)])
@@ -45,23 +55,21 @@ def test_shards_contain_each_case_once(total: int, count: int) -> None:
     assert max(map(len, ranges)) - min(map(len, ranges)) <= 1
 
 
-def test_shards_equal_one_run(
-    shards: list[Path], failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
-) -> None:
+def test_shards_equal_one_run(shards: list[Path], whole_run: Path, tmp_path: Path, watch: RecordingWatch) -> None:
     target = tmp_path / "merged"
     merge_shards(shards[::-1], target)
     finish_campaign(target, ExecutorConfig(1), watch)
-    expected, rows = read_case_rows(failing_campaign), read_case_rows(target)
+    expected, rows = read_case_rows(whole_run), read_case_rows(target)
     assert [row["case"] for row in rows] == list(range(12))
     assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 12
-    merged, single = record.read(target), record.read(failing_campaign)
+    merged, single = record.read(target), record.read(whole_run)
     for key in ("state", "cases", "cases_finished", "cases_crashed", "seed", "definition", "showcase", "evidence"):
         assert merged[key] == single[key], key
     assert "shard" not in merged
     assert len(merged["sessions"]) == 4
     # products of the shards' violations, and of the showcase
     stored = {path.name for path in (target / "cases").iterdir()}
-    assert stored == {path.name for path in (failing_campaign / "cases").iterdir()}
+    assert stored == {path.name for path in (whole_run / "cases").iterdir()}
 
 
 def test_stopped_shard_is_resumed_within_its_cases(shards: list[Path], tmp_path: Path, watch: RecordingWatch) -> None:
@@ -82,13 +90,13 @@ def test_stopped_shard_is_resumed_within_its_cases(shards: list[Path], tmp_path:
 
 
 def test_incomplete_or_different_shards_are_rejected(
-    shards: list[Path], failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path
+    shards: list[Path], whole_run: Path, campaign_file: CampaignFile, tmp_path: Path
 ) -> None:
     (other,) = _run_shards(campaign_file("unanswered_cases = [2]"), tmp_path, 1)
     for directories, message in (
         (shards[:3], "3 of 12 cases are missing, the first is case 9"),
         ([*shards, shards[0]], "both contain case 0"),
-        ([shards[0], failing_campaign], "was run without --shard"),
+        ([shards[0], whole_run], "was run without --shard"),
         ([*shards[:3], other], "differ in the definition"),
     ):
         with pytest.raises(CampaignError, match=message):

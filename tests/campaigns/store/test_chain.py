@@ -224,6 +224,7 @@ def test_rows_without_a_chain_are_reported_as_not_verified(campaign: Path) -> No
     assert (status, "rows: not verified, since" in output) == (1, True), output
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_chain_continues_over_resume_and_append(tmp_path: Path, watch: RecordingWatch) -> None:
     path = write_campaign(tmp_path, "raising_cases = [3]", requirement="")
     directory = run(path, tmp_path / "run", watch, "retain.showcase=none", jobs=1)

@@ -70,6 +70,7 @@ def test_showcase_follows_the_definition(campaign_file: CampaignFile, tmp_path: 
     assert find_worst_cases(time_sum, table, 2) == []
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_unsupported_products_stop_no_campaign(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
@@ -90,6 +91,7 @@ def test_unsupported_products_stop_no_campaign(
         (["retain.products=all", "retain.budget_gb=1e-6"], [0]),
     ],
 )
+@pytest.mark.usefixtures("inline_workers")
 def test_products_of_configured_cases_are_stored(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, overrides: list[str], cases: list[int] | None
 ) -> None:

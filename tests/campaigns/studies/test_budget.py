@@ -29,12 +29,14 @@ from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.systems import scenario_names
 from marsyard.sim.error_sources import ErrorSource
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
+from tests.campaigns.killing import kill_and_resume
 from tests.campaigns.studies.error_model import CAMPAIGN
-from tests.campaigns.studies.killing import kill_and_resume
+from tests.inline_workers import inline_workers_fixture
 
 PARAMETERS = BudgetParameters("ERROR", cases=200)
 
 
+_inline_workers = inline_workers_fixture()
 campaign_path = campaign_fixture(CAMPAIGN)
 
 

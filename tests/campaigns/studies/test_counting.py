@@ -22,6 +22,9 @@ from marsyard.campaigns.studies.runner import prepare_campaign
 from marsyard.campaigns.studies.search import start_search
 from marsyard.scenarios.systems import systems
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign
+from tests.inline_workers import inline_workers_fixture
+
+_inline_workers = inline_workers_fixture()
 
 
 def test_bound_without_violations_is_the_textbook_one() -> None:

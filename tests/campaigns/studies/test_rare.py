@@ -18,10 +18,11 @@ from marsyard.campaigns.studies.rare import continue_rare, start_rare
 from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
 from marsyard.campaigns.studies.results import BudgetParameters, RareParameters, RareResult, SearchParameters
 from marsyard.reports.evaluation import evaluate_run
-from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
-from tests.campaigns.studies.killing import kill_and_resume
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows, run
+from tests.campaigns.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
 
 #: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability norm.sf(3) = 0.00135.
 PARAMETERS = RareParameters("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
@@ -29,6 +30,7 @@ PARAMETERS = RareParameters("LOAD", 5e-2, samples=100, replicates=(4,), random_c
 TIMES = ("wall_time_s", "cpu_time_s")
 
 
+_inline_workers = inline_workers_fixture()
 campaign_path = campaign_fixture(CAMPAIGN)
 
 
@@ -256,6 +258,7 @@ def test_printed_number_of_random_cases_decides(campaign_path: Path, tmp_path: P
     assert "from 0 violations in 368 independent random cases" in output
 
 
-def test_random_cases_are_rejected_for_a_campaign(failing_campaign: Path) -> None:
-    status, output = run_command("append", failing_campaign, 10, "--random")
+def test_random_cases_are_rejected_for_a_campaign(campaign_path: Path, tmp_path: Path) -> None:
+    run(campaign_path, tmp_path / "run", RecordingWatch(), "cases=1")
+    status, output = run_command("append", tmp_path / "run", 10, "--random")
     assert (status, "--random is for studies" in " ".join(output.split())) == (2, True)

@@ -42,20 +42,26 @@ from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain import Site
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.limit_state import CAMPAIGN
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 #: Beta of the runs: 0.6 % of the cases fail, of at most 5 %.
 CAMPAIGN = CAMPAIGN.replace("cases = 100", "cases = 200").replace("probability = 0.99", "probability = 0.95")
 BETA = 2.5
 
 
+def run_text(folder: Path, text: str, cases: int, *overrides: str) -> Path:
+    """Run a campaign with this text; return its folder."""
+    (folder / "campaign.toml").write_text(text)
+    campaign = load_campaign(str(folder / "campaign.toml"), overrides, cases)
+    run_campaign(campaign, folder / "run", ExecutorConfig(1), RecordingWatch())
+    return folder / "run"
+
+
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the limit state; return its folder, which tests must copy."""
-    folder = tmp_path_factory.mktemp("robust")
-    path = folder / "campaign.toml"
-    path.write_text(CAMPAIGN)
-    run_campaign(load_campaign(str(path), [f"beta={BETA}"]), folder / "run", ExecutorConfig(1), RecordingWatch())
-    return folder / "run"
+    return run_text(tmp_path_factory.mktemp("robust"), CAMPAIGN, 200, f"beta={BETA}")
 
 
 @pytest.fixture
@@ -227,13 +233,11 @@ def test_verdicts_of_variants(run: Path) -> None:
 )
 def test_factor_of_a_variant_scales_the_value_of_each_case(tmp_path: Path, dispersion: str) -> None:
     """Half of the value of `beta` in each case, however the campaign sets it; a value replaces it in all cases."""
-    path = tmp_path / "campaign.toml"
-    path.write_text(CAMPAIGN.replace("[dispersions]", f"[dispersions]\nbeta = {{ distribution = {dispersion} }}"))
-    run_campaign(load_campaign(str(path), (), 60), tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    text = CAMPAIGN.replace("[dispersions]", f"[dispersions]\nbeta = {{ distribution = {dispersion} }}")
+    run = run_text(tmp_path, text, 60)
     factor = SystemVariant(name="half", title="half", factors={"beta": 0.5}, source="test")
     value = SystemVariant(name="value", title="the campaign's parameter", values={"beta": 3.0}, source="test")
-    rows = read_case_rows(study(tmp_path / "run", {}, (factor, value), 60))
-    base = read_case_rows(tmp_path / "run")
+    rows, base = read_case_rows(study(run, {}, (factor, value), 60)), read_case_rows(run)
     for half, same, stored in zip(rows[::2], rows[1::2], base, strict=True):
         assert half["beta"] == pytest.approx(0.5 * stored["beta"])
         assert half["load"] == pytest.approx(stored["load"] + 0.5 * stored["beta"])
@@ -242,14 +246,10 @@ def test_factor_of_a_variant_scales_the_value_of_each_case(tmp_path: Path, dispe
 
 def test_values_that_the_scenario_rejects_in_a_case_are_found_before_the_first(tmp_path: Path) -> None:
     variant = SystemVariant(name="broken", title="half a terrain", factors={"terrain": 0.5}, source="test")
-    path, terrain = (
-        tmp_path / "campaign.toml",
-        '[dispersions]\nterrain = { distribution = "integer", low = 0, high = 7 }',
-    )
-    path.write_text(CAMPAIGN.replace("[dispersions]", terrain))
-    run_campaign(load_campaign(str(path), (), 60), tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    terrain = '[dispersions]\nterrain = { distribution = "integer", low = 0, high = 7 }'
+    run = run_text(tmp_path, CAMPAIGN.replace("[dispersions]", terrain), 60)
     with pytest.raises(CampaignError, match=r"broken: .* \(case \d+\)"):
-        study(tmp_path / "run", {}, (variant,), 60)
+        study(run, {}, (variant,), 60)
 
 
 def test_each_study_has_its_own_row_as_assumed(run: Path) -> None:
@@ -352,24 +352,26 @@ def test_unsuitable_options_are_rejected(finished_run: Path, arguments: tuple[st
 @pytest.mark.parametrize("dispersion", ['"fixed", value = 2.0', '"derived", formula = "2.0"'])
 def test_value_that_the_campaign_sets_by_a_dispersion_is_rejected(tmp_path: Path, dispersion: str) -> None:
     text = CAMPAIGN.replace("[dispersions]", f"[dispersions]\nbeta = {{ distribution = {dispersion} }}")
-    (tmp_path / "campaign.toml").write_text(text)
-    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
-    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
-    result = CliRunner().invoke(app, ["robust", str(tmp_path / "run"), "--parameter", "beta=1"])
+    result = CliRunner().invoke(app, ["robust", str(run_text(tmp_path, text, 2)), "--parameter", "beta=1"])
     distribution = dispersion.split(",")[0].strip('"')
     message = f"--parameter beta=1: dispersions.beta of the campaign is '{distribution}'; allowed: parameters without"
     assert (result.exit_code, message in " ".join(result.output.split())) == (2, True), result.output
+
+
+def test_nominal_case_is_not_repeated(tmp_path: Path) -> None:
+    """It is no random draw: the study has the 60 cases after it."""
+    run = run_text(tmp_path, f"{CAMPAIGN}\n[design]\nnominal = true\n", 61)
+    rows = read_case_rows(study(run, {"beta": 1.0}, cases=60))
+    assert {StudyPoint.read(row["standard_point"]).stream for row in rows} == set(range(1, 61))
 
 
 def test_value_in_a_dispersed_table_is_rejected(tmp_path: Path) -> None:
     lines = [line for line in CAMPAIGN.splitlines() if not line.startswith('"loads.')]
     table = 'loads = { distribution = "choice", values = [[0.0, 0.0], [1.0, 1.0]] }'
     lines.insert(lines.index("[dispersions]") + 1, table)
-    (tmp_path / "campaign.toml").write_text("\n".join(lines))
-    campaign = load_campaign(str(tmp_path / "campaign.toml"), (), 2)
-    run_campaign(campaign, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    run = run_text(tmp_path, "\n".join(lines), 2)
     with pytest.raises(CampaignError, match=r"loads\.0 = .*: its table 'loads' is dispersed as a whole"):
-        study(tmp_path / "run", {"loads.0": 3.0})
+        study(run, {"loads.0": 3.0})
 
 
 def test_invalid_value_of_a_variant_is_rejected(run: Path) -> None:

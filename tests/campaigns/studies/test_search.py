@@ -21,11 +21,13 @@ from marsyard.campaigns.studies.results import SearchParameters, SearchResult
 from marsyard.campaigns.studies.runner import prepare_campaign
 from marsyard.campaigns.studies.search import SearchStudy, start_search
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture
+from tests.campaigns.killing import kill_and_resume
 from tests.campaigns.studies import limit_state
-from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.planted_defect import CAMPAIGN
 from tests.command import run_command
+from tests.inline_workers import inline_workers_fixture
 
+_inline_workers = inline_workers_fixture()
 campaign_path = campaign_fixture(CAMPAIGN)
 
 

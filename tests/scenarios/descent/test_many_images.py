@@ -13,8 +13,12 @@ from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.descents import DESCENT, IDEAL_INSTRUMENTS, make_parameters, run_descent
 
 STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:InertialEstimator"
-#: Nine images of a descent that contain the three images of a standard descent.
-NINE_IMAGES: dict[str, Any] = {"images": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
+#: Nine images of a descent that contain the three images of a standard descent; the estimator runs in this process.
+NINE_IMAGES: dict[str, Any] = {
+    "images": 9,
+    "descent": DESCENT | {"interval_s": 3.75 / 4},
+    "executable": {"isolated": False},
+}
 
 
 class InertialEstimator:

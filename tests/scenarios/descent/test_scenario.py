@@ -75,9 +75,9 @@ def test_reported_attitude_error_corrects_the_propagation_to_the_firing() -> Non
     assert 3.7 * 15.0 * np.deg2rad(tilt_deg) > 0.9  # error of the propagation without the correction, m/s
 
 
-def test_instrument_errors_have_the_specified_size() -> None:
+def test_instrument_errors_have_the_specified_size(nominal_case: CaseResult) -> None:
     """The altimeter has an error of 1 % at 3 sigma. A gyro scale error of 100 ppm over 38 revolutions is 1.4 deg."""
-    rows = [run_descent(case).row for case in range(4)]
+    rows = [nominal_case.row, *(run_descent(case).row for case in (1, 2))]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
     independent = np.array([float(row["attitude_error_independent_deg"]) for row in rows])

@@ -4,7 +4,6 @@ The rows of all cases are checked against the declared columns (tests/scenarios/
 """
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +11,12 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.condition_columns import contrast_columns, off_nadir_deg
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisationScenario
 from marsyard.scenarios.localisation.score import conditions
 from marsyard.scenarios.localisation.simulation import INERTIAL_LEAD_S, LocalisedDescent
-from marsyard.scenarios.systems import catalogue
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.streams import Streams
@@ -40,7 +36,6 @@ SMALL: dict[str, Any] = {
 COARSE: dict[str, Any] = {"map": {"side_px": 64}, "camera": {"pixels": 64, "pixel_mrad": 26.0}}
 #: A map without errors of position and elevation.
 EXACT_MAP = {"registration_sd_m": 0.0, "distortion_sd_m": 0.0, "elevation_sd_m": 0.0, "elevation_post_m": 0.0}
-LOC_CAMPAIGNS = [name for name in catalogue() if name.startswith("loc-")]
 
 
 def _make_parameters(**changes: Any) -> LocalisationScenarioParameters:
@@ -272,18 +267,6 @@ def test_haze_reduces_the_contrast() -> None:
     )
     # the air's transmission over 1600 m is exp(-0.8) = 0.45 at nadir; the noise of the detector remains
     assert hazy < 0.8 * clear
-
-
-@pytest.mark.parametrize("name", LOC_CAMPAIGNS)
-def test_campaign_loads_and_its_requirements_use_the_columns(name: str) -> None:
-    campaign = load_campaign(name)
-    assert campaign.definition.scenario == "localisation"
-    assert campaign.definition.requirements
-    for case in range(3):
-        assert isinstance(campaign.parameters(case), LocalisationScenarioParameters)
-    result = _nominal()
-    row = {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
-    check_metrics(campaign.definition, row, Path(name))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from marsyard.scenarios.conformance.candidates import determine_task
 from tests.scenarios.suites import run_suite, write_module
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
+DIFFERENT_ANSWERS = "answers to the same case differ between two calls"
 #: Beginning of a module with a defective part; `poses` returns a valid descent (times, positions, quaternions).
 MODULE_HEADER = """
 import os
@@ -36,115 +37,75 @@ def test_examples_of_the_documentation_conform(name: str, kind: str, monkeypatch
     assert ("random" in result) == (kind != "score")
 
 
-@pytest.mark.parametrize(
-    ("check", "random", "lines", "problem"),
-    [
-        ("answer", False, "return poses(inputs)", "returns a tuple; allowed: marsyard.scenarios.parts.Poses"),
-        ("answer", False, "t, x, q = poses(inputs)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
-        ("answer", False, "t, x, q = poses(inputs)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
-        (
-            "answer",
-            False,
-            "t, x, q = poses(inputs)\nt[5] = t[4]\nreturn Poses(t, x, q)",
-            "time does not increase after",
-        ),
-        (
-            "answer",
-            False,
-            "t, x, q = poses(inputs)\nq[1::2] = [1.0, 0.0, 0.0, 0.0]\nreturn Poses(t, x, q)",
-            "rotates by 180",
-        ),
-        ("answer", False, "return 1 / 0", "it raised ZeroDivisionError"),
-        ("random", True, "return Poses(*poses(inputs))", "its attribute random is true, but two streams give the same"),
-        ("random", False, "return Poses(*poses(inputs, rng.normal()))", "random is false, but two streams give"),
-        (
-            "deterministic",
-            True,
-            "return Poses(*poses(inputs, np.random.normal()))",
-            "its answers to the same case differ between two calls",
-        ),
-        (
-            "deterministic",
-            False,
-            "self.calls = getattr(self, 'calls', 0) + 1\nreturn Poses(*poses(inputs, self.calls))",
-            "depends on earlier cases",
-        ),
-        (
-            "columns",
-            True,
-            "return Poses(*poses(inputs), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
-            "its columns change",
-        ),
-        ("columns", False, "return Poses(*poses(inputs), {'a b': 1.0})", "returns the invalid column name 'a b'"),
-    ],
-)
-def test_motion_defects_are_reported(
-    check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def format_part(kind: str, lines: str) -> str:
+    """Return the source of a part `Defective` with these lines.
+
+    kind: motion or random motion, quantity of an instrument, or type of a score's case
+    """
+    if kind.startswith("Scored"):
+        return f"def Defective(case: {kind}):\n" + textwrap.indent(lines, " " * 4)
+    if kind.endswith("motion"):
+        members = f"random = {kind != 'motion'}\ndef fly(self, inputs, rng):\n"
+    else:
+        members = f"random = False\nquantity = '{kind}'\ndef read(self, truth, rng):\n"
+    return "class Defective:\n" + textwrap.indent(members + textwrap.indent(lines, " " * 4), " " * 4)
+
+
+#: Kind of a part, its lines, the check that finds its defect, and a part of the message.
+DEFECTS = [
+    ("motion", "return poses(inputs)", "answer", "returns a tuple; allowed: marsyard.scenarios.parts.Poses"),
+    ("motion", "t, x, q = poses(inputs)\nreturn Poses(t, x[:, :2], q)", "answer", "positions_m of shape"),
+    ("motion", "t, x, q = poses(inputs)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "answer", "length 0.9"),
+    ("motion", "t, x, q = poses(inputs)\nt[5] = t[4]\nreturn Poses(t, x, q)", "answer", "time does not increase after"),
+    ("motion", "t, x, q = poses(inputs)\nq[1::2] = [1, 0, 0, 0]\nreturn Poses(t, x, q)", "answer", "rotates by 180"),
+    ("motion", "return 1 / 0", "answer", "it raised ZeroDivisionError"),
+    ("random motion", "return Poses(*poses(inputs))", "random", "random is true, but two streams give the same"),
+    ("motion", "return Poses(*poses(inputs, rng.normal()))", "random", "random is false, but two streams give"),
+    ("random motion", "return Poses(*poses(inputs, np.random.normal()))", "deterministic", f"its {DIFFERENT_ANSWERS}"),
+    (
+        "motion",
+        "self.calls = getattr(self, 'calls', 0) + 1\nreturn Poses(*poses(inputs, self.calls))",
+        "deterministic",
+        "depends on earlier cases",
+    ),
+    (
+        "random motion",
+        "return Poses(*poses(inputs), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
+        "columns",
+        "its columns change",
+    ),
+    ("motion", "return Poses(*poses(inputs), {'a b': 1.0})", "columns", "returns the invalid column name 'a b'"),
+    ("altitude", "return InstrumentReadings(truth.times_s[:2], np.ones(2))", "answer", "times_s of shape (2,)"),
+    ("attitude", "return InstrumentReadings(truth.times_s, np.ones((truth.times_s.size, 4)))", "answer", "length"),
+    (
+        "altitude",
+        "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))",
+        "answer",
+        "infinite altitude",
+    ),
+    ("altitude", "return truth.times_s", "answer", "a ndarray; allowed: marsyard.scenarios.parts.InstrumentReadings"),
+    (
+        "altitude",
+        "truth.times_s[0] -= 1.0\nreturn InstrumentReadings(truth.times_s, 1.0 * truth.times_s)",
+        "inputs",
+        "it changed its input, a InstrumentTruth",
+    ),
+    ("ScoredDescent", "return {'east': case.answer.velocity_m_s[0]}", "answer", "it raised TypeError"),
+    ("ScoredLanding", "return {'site': 'here'}", "answer", "returns site of type str; allowed: a number"),
+    ("ScoredRun", "return {a.state.name: 1.0 for a in case.answers}", "columns", "its columns change"),
+    ("ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "inputs", "it changed its input, a ScoredDescent"),
+    ("ScoredRun", "CALLS.append(1)\nreturn {'calls': len(CALLS)}", "deterministic", f"its {DIFFERENT_ANSWERS}"),
+]
+
+
+@pytest.mark.parametrize(("kind", "lines", "check", "problem"), DEFECTS)
+def test_defects_are_reported(
+    kind: str, lines: str, check: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    header = f"class Defective:\n    random = {random}\n    def fly(self, inputs, rng):\n"
-    body = header + textwrap.indent(lines, " " * 8)
-    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + textwrap.dedent(body))
+    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + format_part(kind, lines))
     (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
     assert result.next_step
-
-
-@pytest.mark.parametrize(
-    ("check", "quantity", "lines", "problem"),
-    [
-        ("answer", "altitude", "return InstrumentReadings(truth.times_s[:2], np.ones(2))", "times_s of shape (2,)"),
-        ("answer", "attitude", "return InstrumentReadings(truth.times_s, np.ones((truth.times_s.size, 4)))", "length"),
-        (
-            "answer",
-            "altitude",
-            "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))",
-            "infinite altitude",
-        ),
-        (
-            "answer",
-            "altitude",
-            "return truth.times_s",
-            "returns a ndarray; allowed: marsyard.scenarios.parts.InstrumentReadings",
-        ),
-        (
-            "inputs",
-            "altitude",
-            "truth.times_s[0] -= 1.0\nreturn InstrumentReadings(truth.times_s, 1.0 * truth.times_s)",
-            "it changed its input, a InstrumentTruth",
-        ),
-    ],
-)
-def test_instrument_defects_are_reported(
-    check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    header = f"class Defective:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
-    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + header + textwrap.indent(lines, " " * 8))
-    (result,) = run_suite(f"{name}:Defective", check).values()
-    assert problem in result.problem
-
-
-@pytest.mark.parametrize(
-    ("check", "annotation", "lines", "problem"),
-    [
-        ("answer", "ScoredDescent", "return {'east': case.answer.velocity_m_s[0]}", "it raised TypeError"),
-        ("answer", "ScoredLanding", "return {'site': 'here'}", "returns site of type str; allowed: a number"),
-        ("columns", "ScoredRun", "return {a.state.name: 1.0 for a in case.answers}", "its columns change"),
-        ("inputs", "ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "it changed its input, a ScoredDescent"),
-        (
-            "deterministic",
-            "ScoredRun",
-            "CALLS.append(1)\nreturn {'calls': len(CALLS)}",
-            "its answers to the same case differ between two calls",
-        ),
-    ],
-)
-def test_score_defects_are_reported(
-    check: str, annotation: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    body = f"def bad(case: {annotation}):\n" + textwrap.indent(lines, " " * 4)
-    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + textwrap.dedent(body))
-    (result,) = run_suite(f"{name}:bad", check).values()
-    assert problem in result.problem
 
 
 @pytest.mark.parametrize(

@@ -207,7 +207,8 @@ def test_stuck_rover_is_no_failure_of_the_tracker() -> None:
 
 
 def test_loss_by_the_tracker_of_a_slipping_rover_is_lost() -> None:
-    result = run_slipping_rover(algorithm="tests.scenarios.rover.trackers:LosingTracker")
+    algorithm = "tests.scenarios.rover.trackers:LosingTracker"
+    result = run_slipping_rover(algorithm=algorithm, executable={"isolated": False})
     assert result.outcome == "LOST"
     # the population of stuck rovers does not depend on the tracker
     assert (result.row["stuck"], result.row["mobile"], result.row["target_held"]) == (True, False, False)
