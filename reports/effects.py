@@ -23,6 +23,9 @@ from marsyard.reports.statistics.difference_tests import correct_holm
 from marsyard.reports.statistics.drivers import MIN_CASES, Driver, estimate_driver
 from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, note_text, p_text, percent
 
+#: Maximum number of conditions in a table, and of cases that are used for the ranking.
+_MAX_DRIVERS, _MAX_DRIVER_CASES = 12, 20_000
+
 
 @dataclass(frozen=True)
 class Effect:
@@ -98,10 +101,6 @@ def correlation_text(effect: Effect) -> str:
     """Format a rank correlation with its interval; a dash for NaN."""
     value, lower, upper = map(coefficient, (effect.rank_correlation, effect.lower, effect.upper))
     return NOTHING if math.isnan(effect.rank_correlation) else f"{value} ({lower} to {upper})"
-
-
-#: Maximum number of conditions in a table, and of cases that are used for the ranking.
-_MAX_DRIVERS, _MAX_DRIVER_CASES = 12, 20_000
 
 
 class RankedDriver(NamedTuple):
