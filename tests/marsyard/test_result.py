@@ -248,9 +248,8 @@ def test_bound_of_a_figure_is_in_the_unit_of_the_column(tmp_path: Path) -> None:
     """A requirement of 5 on a tenth of the error draws its bound at an error of 50."""
     scaled = {**VELOCITY, "scale": 0.1}
     result = Result(write_run(tmp_path / "run", make_rows(60), [scaled]))
-    (bound,) = (
-        line.get_xdata()[0] for line in result.figure("histogram").axes[0].lines if line.get_linestyle() == "--"
-    )
+    lines = result.figure("histogram").axes[0].lines
+    (bound,) = (np.asarray(line.get_xdata())[0] for line in lines if line.get_linestyle() == "--")
     assert bound == pytest.approx(10.0 * VELOCITY["bound"])
 
 
