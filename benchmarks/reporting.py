@@ -25,7 +25,7 @@ from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import update, write_first_record
 from marsyard.reports.campaign_report import write_report
-from marsyard.reports.report_file import sign_report
+from marsyard.reports.signature import sign_report
 
 #: Number of random columns that are added, so that a row has as many columns (99) as one of `dimes-gusev`.
 ADDITIONAL_COLUMNS = 82

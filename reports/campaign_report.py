@@ -1,6 +1,6 @@
 """Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results.
 
-The files are signed with the user's key, if there is one (`marsyard.reports.report_file`).
+The files are signed with the user's key, if there is one (`marsyard.reports.signature`).
 """
 
 import json
@@ -31,11 +31,12 @@ from marsyard.reports.populations import outcome_counts
 from marsyard.reports.presentation import presentations
 from marsyard.reports.provenance import read_algorithms
 from marsyard.reports.rare import rare_bound_sentence, rare_section, rare_sentences
-from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary, sign_report
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.robustness_section import robustness_section
 from marsyard.reports.robustness_wording import robust_sentences, robustness_text
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Section, SectionMaker, Subject
+from marsyard.reports.signature import sign_report
 from marsyard.reports.stored import table
 from marsyard.reports.tables import error_summaries
 from marsyard.reports.validity import validity_section

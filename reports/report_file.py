@@ -1,29 +1,18 @@
-"""Typed record of `report.json`, which the report creates and the dashboard reads, and the signature of a report.
+"""Typed record of `report.json`: created by the report, and read by the dashboard."""
 
-The signature shows that this user's installation wrote a report from the present rows of a campaign.
-"""
-
-import hmac
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.definition.evidence import Evidence
-from marsyard.campaigns.definition.identity import hash_sources
-from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.hidden_folders import hide_folders
-from marsyard.campaigns.store.key import sign
-from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports.provenance import Algorithm
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.error_summary import ErrorSummary
-from marsyard.reports.stored import RECORD_FILE, TABLE_FILE
 from marsyard.reports.validity import Validity
 from marsyard.reports.verdicts import Verdict
 
@@ -132,38 +121,3 @@ def _to_json_types(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, int | bool) else hide_folders(str(value))
-
-
-#: Hash of page and data with the key of the user who wrote them; others' reports are written again for the dashboard.
-SIGNATURE_FILE = "report.signature"
-_REPORTS_FOLDER = Path(__file__).parent
-
-
-def sign_report(directory: Path, campaign: Path) -> None:
-    """Record that this user's installation wrote the report in a folder from the present rows of a campaign's folder.
-
-    Raises StoreError if the key of the user cannot be read.
-    """
-    write_atomic(directory / SIGNATURE_FILE, _compute_signature(directory, campaign))
-
-
-def is_own_report(directory: Path, campaign: Path) -> bool:
-    """Whether this user's installation wrote the report in a folder from the present rows of a campaign's folder."""
-    try:
-        signature = (directory / SIGNATURE_FILE).read_bytes()
-        return hmac.compare_digest(signature, _compute_signature(directory, campaign).encode())
-    except (OSError, StoreError, RuntimeError):
-        return False
-
-
-def _compute_signature(directory: Path, campaign: Path) -> str:
-    """Sign page and data of a report, the program that computes verdicts and pages, and the record and rows."""
-    files = (directory / PAGE_FILE, directory / REPORT_JSON, campaign / RECORD_FILE, campaign / TABLE_FILE)
-    return sign(hash_program().encode(), *(path.read_bytes() if path.is_file() else b"" for path in files))
-
-
-@cache
-def hash_program() -> str:
-    """Compute the hash of the program that writes reports and packages: all files of `reports`, also its evidence."""
-    files = sorted(path for path in _REPORTS_FOLDER.rglob("*") if path.is_file() and path.suffix != ".pyc")
-    return hash_sources((path.relative_to(_REPORTS_FOLDER).as_posix(), path) for path in files)

@@ -27,7 +27,8 @@ from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
 from marsyard.reports.page_environment import page_environment
-from marsyard.reports.report_file import REPORT_JSON, SIGNATURE_FILE, hash_program, read_report
+from marsyard.reports.report_file import REPORT_JSON, read_report
+from marsyard.reports.signature import SIGNATURE_FILE, hash_program
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.validation_rows import VALIDATION_FILE
 

@@ -32,7 +32,8 @@ from marsyard.reports.campaign_report import build_report, create_subject, forma
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.joint import read_joint_evidence
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, combine_verdicts
-from marsyard.reports.report_file import REPORT_JSON, CampaignReport, hash_program, read_report
+from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.signature import hash_program
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count

@@ -13,7 +13,8 @@ from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.campaign_report import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.provenance import format_tested_algorithms
-from marsyard.reports.report_file import REPORT_JSON, CampaignReport, is_own_report, read_report
+from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.signature import is_own_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.scenarios.systems import find_system
 

@@ -3,26 +3,20 @@
 All pages are in the site's folder and need no other files. The reports of campaigns are copied into it, if this user's
 installation wrote them, or are written again. The other pages of a campaign repeat excerpts of its report, so that no
 case is evaluated or drawn twice. Pages of unchanged campaigns are not written again.
-
-An excerpt is the content of an element `article` of `templates/report.html.j2`, which contains no other `article`. The
-template and this module share the names of these elements (`marsyard.reports.page_environment`). The report escapes all
-values, so that no value contains a tag that begins or ends an excerpt.
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from markupsafe import Markup
 
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports.campaign_report import VERIFICATION_FILE
 from marsyard.reports.dashboard import entries as campaign_entries
 from marsyard.reports.dashboard.entries import Entry
+from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.dashboard.requirement_rows import (
     MAX_OTHER_VERDICTS,
     Cell,
@@ -33,7 +27,7 @@ from marsyard.reports.dashboard.requirement_rows import (
     requirement_rows,
 )
 from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.page_environment import CASE_ANCHOR, LISTS_CLASS, embed_json, page_environment, script_hash
+from marsyard.reports.page_environment import embed_json, page_environment, script_hash
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import read_cases
 from marsyard.reports.verdict_files import requirement_evidence, verification_csv
@@ -177,38 +171,3 @@ def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
 
 def _render(template: str, **context: Any) -> str:
     return page_environment().get_template(template).render(context)
-
-
-#: Element with lists of cases by requirement; its group is the content.
-_LISTS = re.compile(rf'<article class="{LISTS_CLASS}">(.*?)</article>', re.DOTALL)
-#: Element with results and images of a case; its groups are the number of the case and the content.
-_CASE = re.compile(rf'<article id="{CASE_ANCHOR}(\d+)"[^>]*>(.*?)</article>', re.DOTALL)
-
-
-@dataclass(frozen=True)
-class Excerpts:
-    """Lists of cases by requirement (may be empty), and results and images of each case that the report shows."""
-
-    lists: Markup
-    cases: Mapping[int, Markup]
-
-
-def case_file(case: int) -> str:
-    """Return the name of the page of a case."""
-    return f"case-{case}.html"
-
-
-def read_excerpts(report: str) -> Excerpts:
-    """Read the excerpts of a report's page; links to its cases become links to their pages."""
-    contents = {int(case): content for case, content in _CASE.findall(report)}
-    lists = "".join(_LISTS.findall(report))
-    return Excerpts(
-        _link_pages(lists, contents), {case: _link_pages(content, contents) for case, content in contents.items()}
-    )
-
-
-def _link_pages(content: str, cases: Mapping[int, str]) -> Markup:
-    """Replace the links to cases within the report by links to their pages. The content is HTML of the report."""
-    for case in cases:
-        content = content.replace(f'href="#{CASE_ANCHOR}{case}"', f'href="{case_file(case)}"')
-    return Markup(content)  # noqa: S704

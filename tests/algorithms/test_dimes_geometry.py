@@ -18,6 +18,7 @@ from tests.algorithms.synthetic_descent import (
     CAMERA,
     INTERVAL_S,
     ROWS_SUMMED,
+    Texture,
     draw_terrain,
     expose_scene,
     make_calibration,
@@ -310,3 +311,54 @@ def test_ground_lattice_is_north_up() -> None:
     lattice = rectification.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
     np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])
     np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])
+
+
+def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
+    """Estimate the displacement (east, north) of a patch from the expected one, metres, by one least-squares step."""
+    east, north = lattice[..., 0], lattice[..., 1]
+    slopes = [
+        (wave_brightness(east + dx, north + dy) - wave_brightness(east - dx, north - dy)) / 0.2
+        for dx, dy in ((0.1, 0.0), (0.0, 0.1))
+    ]
+    design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
+    solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
+    return np.asarray(solution[:2])
+
+
+def make_wave_texture() -> Texture:
+    """Create a texture with the analytic brightness `wave_brightness`: waves of 60 to 200 m."""
+    offsets_m = 1.5 * np.arange(2048)
+    return Texture(wave_brightness(offsets_m[None, :], -offsets_m[:, None]).astype(np.float32), 1.5)
+
+
+def wave_brightness(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
+    east, north = (2.0 * np.pi * x / (2048 * 1.5) for x in (east_m, north_m))
+    return 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
+
+
+def test_ground_and_pixel_projections_are_inverse() -> None:
+    view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
+    pixels = overlap.grid_pixels(view.size, 16)
+    ground, is_within_limit = ground_view.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
+    projections, visible = ground_view.pixels_from_ground(view, ground)
+    assert is_within_limit.sum() > 200
+    assert np.all(visible[is_within_limit])
+    np.testing.assert_allclose(projections[is_within_limit], pixels[is_within_limit], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "attitude", [tilt_body(0.0, 0.0, 0.0), tilt_body(18.0, 200.0, 140.0), tilt_body(25.0, 80.0, 300.0)]
+)
+def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None:
+    position = np.array([700.0, -300.0, 1700.0])
+    counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
+    view = make_view(attitude, 1700.0, 0.0, counts)
+    centre, is_within_limit = ground_view.ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
+    assert is_within_limit[0]
+    patch = rectification.rectify_patch(view, centre[0], 61, 5.5)
+    lattice = rectification.ground_lattice(centre[0], 61, 5.5) + position[:2]
+    expected = wave_brightness(lattice[..., 0], lattice[..., 1])
+    shift = _estimate_shift(patch / 1600.0, expected, lattice)
+    # 0.01 of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
+    assert np.abs(shift).max() < 0.06
+    np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)

@@ -331,3 +331,10 @@ def test_calibration_error_scales_the_motion() -> None:
     pairs = [replace(_render_pair(pose), cameras=(CAMERAS[0], wide)) for pose in (START, straight)]
     result = estimate_motion(pairs[0], pairs[1], straight)
     assert np.linalg.norm(result.first_from_second.translation) / 0.5 == pytest.approx(1.05, abs=0.01)
+
+
+def test_limits_of_depth_are_respected() -> None:
+    pair = RectifiedPair.from_measurement(_render_pair(START))
+    depth = (pair.points(1.2, 3.0) - pair.camera.c) @ pair.camera.a
+    assert depth.max() <= 3.0 + 1e-9
+    assert depth.min() > 1.2

@@ -326,3 +326,27 @@ def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[st
     with pytest.raises(AlgorithmError, match=message) as error:
         estimate(make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}"), inputs.descent(3))
     assert error.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)
+
+
+def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The increments are exact: the integrated velocities equal the inertial velocities of the frames."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    example = importlib.import_module("velocity_stream")
+    measurements = inputs.inertial_descent(5)
+    expected = estimate(example.ChainedShifts(), measurements)
+    # the inertial velocities of later frames are wrong and must not be used
+    velocities = measurements.inertial_velocities_m_s
+    assert velocities is not None
+    wrong = replace(
+        measurements,
+        inertial_velocities_m_s=velocities + 50.0 * (np.arange(5.0) > 0.0)[:, None],
+        interval_velocities_m_s=measurements.interval_velocities_m_s + 50.0,
+    )
+    reference = estimate(example.IntegratedShifts(), wrong)
+    np.testing.assert_allclose(reference.velocity_m_s, expected.velocity_m_s, atol=1e-6)  # type: ignore[arg-type]
+    program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'} --increments")
+    for _ in range(2):
+        actual = estimate(program, wrong)
+        np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
+    end_idle_programs()

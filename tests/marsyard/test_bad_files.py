@@ -11,7 +11,7 @@ import pytest
 
 from marsyard.scenarios.conformance import inputs
 from tests.command import run_command
-from tests.scenarios.measured.folders import write_velocity_folder
+from tests.scenarios.measured.folders import read_rows, write_text_rows, write_velocity_folder
 from tests.scenarios.test_terrain_files import write_tif
 
 #: Begin of a PDS3 label.
@@ -87,3 +87,18 @@ def run_and_expect_error(arguments: list[object], path: Path, message: str) -> N
     status, output = run_command(*arguments)
     assert (status, output[:7], str(path) in output) == (2, "error: ", True), output
     assert message in output
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ({"qx": "nan"}, "line 3: qx is 'nan'; allowed: a finite number"),
+        ({"time_s": "0.0"}, "line 3: time goes from 100 to 0 s"),
+        ({"qw": "2.0"}, "line 3: the quaternion qx to qw has the length"),
+        ({"qx": "1", "qy": "0", "qz": "0", "qw": "0"}, "line 3: the camera looks up, 90.0 deg"),
+    ],
+)
+def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    write_text_rows(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
+    run_and_expect_error(["ingest", folder, "--out", tmp_path / "out"], folder / "images.csv", message)

@@ -87,3 +87,14 @@ def test_campaign_with_a_failure_is_not_repeated(tmp_path: Path) -> None:
     assert "A new campaign" not in output
     # one failure, first look at 24 cases: 573 cases (docs/explanation/statistics.md)
     assert "to decide: marsyard append run 549" in output
+
+
+@pytest.mark.slow
+def test_new_campaign_has_a_terrain_for_each_case(tmp_path: Path) -> None:
+    """Cases on shared terrains need more: a new campaign without shared terrains is named, and is decided."""
+    shared = DISPERSIONS.replace("99999", "11")
+    _, output, _ = marsyard("run", write_small_campaign(tmp_path, "all", range(0), shared), "--out", "run")
+    (cases,) = re.findall(r"with a new seed, and a terrain for each case, needs only \d+ cases \(-n (\d+)\)", output)
+    assert cases == "230"
+    path = write_small_campaign(tmp_path, "all", range(0))
+    assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from marsyard.campaigns.running.conformance import run_conformance_checks
 from marsyard.scenarios.conformance import inputs, trackers
-from marsyard.scenarios.conformance.candidates import determine_task
+from marsyard.scenarios.conformance.candidates import Subject, determine_task
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.rover.task import TRACKING
@@ -239,3 +240,22 @@ def test_inputs_of_the_suite_are_physically_consistent() -> None:
     blank = inputs.make_blank(descent, inputs.BLANKS["saturated"])
     assert {int(image.counts.min()) for image in blank.images} == {4095}
     assert trackers.take_images(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lines", "problem"),
+    [
+        ("os.chdir('/')", "it changed the state of its process: "),
+        ("os.environ['X_TEST'] = '1'", "it changed the state of its process: "),
+        ("signal.signal(signal.SIGTERM, signal.SIG_IGN)", "it changed the state of its process: "),
+    ],
+)
+def test_changed_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: str, problem: str) -> None:
+    """Each check runs in its own process; the suite compares the state of the process before and after."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    spec = write_defective_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NO_ANSWER"))
+    first_check = next(iter(run_conformance_checks(Subject(spec, "velocity", 60.0))))
+    assert (first_check.check, first_check.passed) == ("answer", False)
+    assert problem in first_check.problem
+    assert first_check.next_step

@@ -147,3 +147,17 @@ def test_kernels_are_ready_only_for_marked_scenario_and_folder(tmp_path: Path, m
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     mark_ready("descent")
     assert not kernels_are_ready("descent")
+
+
+def test_kernels_are_never_ready_without_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    mark_ready("descent")
+    assert not kernels_are_ready("descent")
+
+
+def test_kernels_of_another_checkout_are_not_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba stores compiled code per source folder, although the cache folder depends on the content of the sources."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    mark_ready("descent")
+    monkeypatch.setattr(kernel_cache, "__file__", str(tmp_path / "marsyard" / "sim" / "kernel_cache.py"))
+    assert not kernels_are_ready("descent")

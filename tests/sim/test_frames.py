@@ -65,3 +65,7 @@ def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
     result = Rotation.from_quat(accumulate_quaternions(steps.as_quat()))
     assert_allclose(result.as_matrix(), expected, atol=1e-12)
     assert accumulate_quaternions(np.empty((0, 4))).shape == (0, 4)
+
+
+def test_no_quaternions_accumulate_to_none() -> None:
+    assert accumulate_quaternions(np.empty((0, 4))).shape == (0, 4)

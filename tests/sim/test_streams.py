@@ -136,3 +136,8 @@ def test_blended_numbers_have_the_shapes_of_numpy() -> None:
     assert generator.standard_normal((2, 2), dtype=np.float32).dtype == np.float32
     assert 0 <= int(generator.integers(10)) < 10
     assert [child.random() for child in generator.spawn(2)] != [generator.random()] * 2
+
+
+def test_one_component_has_the_numbers_of_its_case() -> None:
+    alone = Streams(5, "campaign", 8).generator("imu").standard_normal(10)
+    np.testing.assert_array_equal(Streams(5, "campaign", 8, ((8, 1.0),)).generator("imu").standard_normal(10), alone)

@@ -6,7 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.elevation import elevation_map
-from marsyard.algorithms.hda.scene import CameraView, surface_from_camera, up_direction, world_from_surface
+from marsyard.algorithms.hda.scene import (
+    CameraView,
+    plane_normal,
+    surface_from_camera,
+    up_direction,
+    world_from_surface,
+)
 from marsyard.sim.camera import camera_pose
 from tests.algorithms.hda.relief_scene import make_camera, make_pose
 
@@ -103,3 +109,30 @@ def test_gravity_source_follows_the_options() -> None:
     # The fit error of the 350 other points, with 1 cm of noise and an RMS distance of 2.3 m from the middle, is
     # 0.01 / (sqrt(350) 2.3) = 2e-4 rad.
     assert np.arccos(min(float(result[SurfaceFrame.PLANE] @ state_up), 1.0)) < 2e-3
+
+
+def test_map_has_one_point_per_cell_on_average() -> None:
+    points = draw_points(600, np.random.default_rng(1))
+    ground = elevation_map(points)
+    extent = np.ptp(points[:, :2], axis=0)
+    # The paper's cell size s = sqrt(A / N), and the number of whole cells that cover the box.
+    assert ground.cell_m == pytest.approx(np.sqrt(extent[0] * extent[1] / 600))
+    assert ground.elevation_m.shape == tuple(int(np.ceil(side / ground.cell_m)) for side in extent[::-1])
+
+
+def test_plane_is_reconstructed_from_even_points() -> None:
+    x, y = np.meshgrid(np.arange(40) * 0.25, np.arange(30) * 0.25)
+    points = np.column_stack([x.ravel(), y.ravel(), 0.2 * x.ravel() - 0.1 * y.ravel() - 9.0])
+    ground = elevation_map(points)
+    positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
+    plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
+    # Points are up to half a cell from the cell centre: the error is at most the rise within half a cell.
+    assert np.nanmax(np.abs(ground.elevation_m - plane)) < 0.5 * 0.3 * ground.cell_m
+    assert not np.any(np.isnan(ground.elevation_m))
+
+
+def test_robust_normal_points_to_the_camera() -> None:
+    points = draw_points(200, np.random.default_rng(5))
+    expected = np.array([-0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
+    np.testing.assert_allclose(plane_normal(points, 0), expected, atol=1e-9)
+    np.testing.assert_allclose(plane_normal(-points, 0), -expected, atol=1e-9)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.algorithms.hda import HdaOptions, Safety, hazard_maps, safe_site
-from marsyard.algorithms.hda.elevation import ElevationMap, fill_small_holes
+from marsyard.algorithms.hda.elevation import ElevationMap, elevation_map, fill_small_holes, grassfire
 from marsyard.algorithms.hda.hazards import (
     Resolution,
     classify_footprints,
@@ -315,3 +315,63 @@ def test_steep_footprints_are_hazards() -> None:
     for slope_deg, expected in ((12.9, Safety.SAFE), (13.1, Safety.HAZARD)):
         ground = make_ground(slope_y=float(np.tan(np.radians(slope_deg))))
         assert np.all(classify_footprints(ground, SHARP, options)[10:70, 10:90] == expected)
+
+
+def test_elevation_map_is_centred_on_its_points() -> None:
+    x, y = np.meshgrid(np.arange(10.0), np.arange(6.0))
+    ground = elevation_map(np.stack([x.ravel(), y.ravel(), np.zeros(60)], axis=-1))
+    rows, columns = ground.elevation_m.shape
+    corners = ground.positions(np.array([[0.0, 0.0], [rows - 1.0, columns - 1.0]]))
+    np.testing.assert_allclose(corners.mean(axis=0), [4.5, 2.5], atol=1e-9)
+
+
+def test_grassfire_transform_equals_distance_to_nearest_seed() -> None:
+    rng = np.random.default_rng(4)
+    is_seed = rng.random((40, 50)) < 0.01
+    seeds = np.argwhere(is_seed)
+    cells = np.moveaxis(np.indices(is_seed.shape), 0, -1).reshape(-1, 1, 2)
+    expected = np.linalg.norm(cells - seeds, axis=-1).min(axis=1).reshape(is_seed.shape)
+    np.testing.assert_allclose(grassfire(is_seed), expected, rtol=1e-5)
+    assert np.all(np.isinf(grassfire(np.zeros((3, 3), dtype=bool))))
+
+
+def test_map_holes_are_not_interpolated() -> None:
+    flat = make_ground(100, 100)
+    elevation = flat.elevation_m.copy()
+    elevation[30:70, 30:70] = np.nan
+    maps = hazard_maps(replace(flat, elevation_m=elevation), OPTIONS)
+    assert np.all(maps.safety[30:70, 30:70] == Safety.UNKNOWN)
+    assert np.any(maps.safety == Safety.SAFE)
+
+
+def test_single_empty_cells_do_not_hide_the_ground() -> None:
+    """Every fifth cell of level ground is empty: a lander's radius around each of them would be the whole map."""
+    flat = make_ground(60, 60)
+    elevation = flat.elevation_m.copy()
+    elevation[::5, ::5] = np.nan
+    holed = replace(flat, elevation_m=elevation)
+    assert not np.any(hazard_maps(holed, OPTIONS).safety == Safety.SAFE)
+    filled = fill_small_holes(holed, 2.0 * CELL_M)
+    assert np.mean(hazard_maps(filled, OPTIONS).safety == Safety.SAFE) > 0.5
+
+
+def test_slope_and_roughness_hazards_are_combined() -> None:
+    zero = np.zeros((80, 100))
+    rough, steep = zero.copy(), zero.copy()
+    rough[40, 30], steep[40, 70] = 1.0, 1.0
+    safety = safe_landing_map(steep, rough, CELL_M, OPTIONS)
+    assert safety[40, 30] == safety[40, 70] == Safety.HAZARD
+    assert safety[40, 50] == Safety.SAFE
+
+
+def test_steep_ground_is_a_hazard_next_to_level_ground() -> None:
+    flat = make_ground(80, 100)
+    ramp = np.maximum(np.arange(100) - 50, 0) * CELL_M * np.tan(np.deg2rad(20.0))
+    maps = hazard_maps(replace(flat, elevation_m=flat.elevation_m + ramp), OPTIONS)
+    assert np.rad2deg(maps.slope_rad[40, 85]) == pytest.approx(20.0, abs=0.01)
+    assert np.rad2deg(maps.slope_rad[40, 15]) == pytest.approx(0.0, abs=0.01)
+    assert maps.safety[40, 75] == Safety.HAZARD
+    assert maps.safety[40, 20] == Safety.SAFE
+    site = safe_site(maps.safety, np.array([40.0, 50.0]))
+    assert site is not None
+    assert site[1] < 40

@@ -6,6 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda import CameraMotion, HdaOptions
 from marsyard.algorithms.hda.estimator import check_motion
+from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.motion import MotionStart, estimate_motion, plane_depths, range_starts
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
@@ -186,3 +187,15 @@ def test_level_ground_depths_match_a_plane() -> None:
     np.testing.assert_allclose(ground @ up, -10.0, rtol=1e-12)
     # A ray above the horizon does not intersect the ground: its depth is the measured range.
     assert plane_depths(np.array([[0.0, -5.0]]), 12.0, up)[0] == 12.0
+
+
+def test_residuals_are_reprojection_errors_in_pixels() -> None:
+    rng = np.random.default_rng(9)
+    points, depths = make_tracks(rng, 0.05)
+    true_motion = draw_motion(rng)
+    second = project_points(points, depths, true_motion) + 0.01
+    motion = kernels.MotionArrays(
+        true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths
+    )
+    residuals = kernels.residuals(kernels.MatchArrays(points, second, FOCAL_PX, 1.0), motion)
+    np.testing.assert_allclose(residuals, -0.01 * FOCAL_PX, rtol=1e-9)

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions, Matches
-from marsyard.algorithms.hda.preparation import resample_second
-from marsyard.algorithms.hda.scene import LandingScene, apply_flat_field, build_scene
+from marsyard.algorithms.hda.preparation import MEAN_WINDOW_PX, filter_view, resample_second
+from marsyard.algorithms.hda.scene import LandingScene, apply_flat_field, build_scene, project_points
 from marsyard.algorithms.hda.structure import dense_structure
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorImage
@@ -118,3 +118,38 @@ def test_corrected_counts_match_ideal_image(row_times_s: tuple[float, float]) ->
     max_smear = np.abs(smeared_counts - expected).max() / expected.mean()
     # The transfer of 240 rows takes 240 x 5 us = 1.2 ms, 30 % of the exposure time; lens fall-off reduces it.
     assert (max_smear > 0.2) == (row_times_s[0] > 0.0)
+
+
+def test_filtered_image_has_no_local_mean(landing_scene: LandingScene) -> None:
+    view = landing_scene.views[0]
+    counts = filter_view(view).counts
+    half = MEAN_WINDOW_PX
+    inner = counts[half:-half, half:-half].astype(np.float64)
+    assert abs(inner.mean() - 32768.0) < 0.05 * inner.std()
+    # a brighter image has the same counts, up to rounding to 1 / 8 count
+    brighter = filter_view(replace(view, counts=view.counts + np.uint16(100))).counts
+    np.testing.assert_allclose(brighter.astype(np.int64), counts.astype(np.int64), atol=1)
+
+
+def test_resampled_image_has_orientation_and_scale_of_the_first(scene: Pass, landing_scene: LandingScene) -> None:
+    motion = scene.second_from_first
+    views, resampled_from_first = resample_second(landing_scene.views, motion, 10.0)
+    assert resampled_from_first.rotation.magnitude() < 1e-12
+    # points at a depth of 10 m have the same distances in pixels in both images
+    points = np.array([[0.3, -0.2, 10.0], [1.3, -0.2, 10.0], [0.3, 0.8, 10.0]])
+    second_pixels, _ = views[1].camera.project(resampled_from_first.apply(points))
+    focal = landing_scene.views[0].focal_px
+    np.testing.assert_allclose(second_pixels - second_pixels[0], focal * 0.1 * (points - points[0])[:, :2], atol=1e-9)
+    # both images of a point have the same brightness; 0.01 m of ground is 0.4 px
+    pixels = np.array([[100.0, 80.0], [160.0, 120.0], [210.0, 100.0]])
+    ground = scene.camera(0), scene.ground(0, pixels)
+    camera_points = (ground[1] - ground[0].c) @ np.column_stack(
+        [ground[0].right, np.cross(ground[0].a, ground[0].right), ground[0].a]
+    )
+    matched, is_visible = project_points(views[1].camera, resampled_from_first.apply(camera_points))
+    original, _ = project_points(landing_scene.views[1].camera, motion.apply(camera_points))
+    assert np.all(is_visible)
+    for (u, v), (u2, v2) in zip(np.rint(matched).astype(int), original, strict=True):
+        low_u, low_v = int(u2), int(v2)
+        window = landing_scene.views[1].counts[low_v - 1 : low_v + 3, low_u - 1 : low_u + 3]
+        assert window.min() <= views[1].counts[v, u] <= window.max()

@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus
+from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.motion import CameraMotion
 from marsyard.algorithms.hda.scene import LandingScene, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
     epipolar_segments,
+    forward_backward_error,
     grid_spacing_px,
     match_pixels,
     pixel_lattice,
@@ -94,16 +96,6 @@ def test_unrelated_image_has_few_matches(scene: Pass, landing_scene: LandingScen
     assert matches.accepted.mean() < 0.01
 
 
-def test_triangulation_is_exact() -> None:
-    rng = np.random.default_rng(3)
-    positions = rng.uniform(-0.3, 0.3, (2000, 2))
-    depths = rng.uniform(9.0, 11.0, 2000)
-    true_motion = rigid(Rotation.from_rotvec([0.02, -0.03, 0.05]), np.array([1.0, 0.0, 0.0]))
-    points = true_motion.apply(np.column_stack([positions, np.ones(2000)]) * depths[:, None])
-    second = points[:, :2] / points[:, 2:]
-    np.testing.assert_allclose(triangulate(positions, second, true_motion), depths, rtol=1e-10)
-
-
 def test_diverging_lines_of_sight_have_no_depth() -> None:
     positions = np.array([[0.1, 0.2]])
     assert np.isnan(triangulate(positions, positions, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
@@ -171,3 +163,72 @@ def test_refined_grid_resolves_the_narrowest_hazard(landing_scene: LandingScene)
     assert grid_spacing_px(view, (900.0, 1100.0), options) == 1
     assert grid_spacing_px(view, (0.9, 1.1), options) == 16
     assert grid_spacing_px(view, (9.0, 11.0), replace(options, refine_grid=False)) == 16
+
+
+def test_best_match_has_minimum_absolute_difference() -> None:
+    rng = np.random.default_rng(1)
+    first = rng.integers(0, 4096, (60, 90)).astype(np.uint16)
+    second = np.roll(first, (3, 9), axis=(0, 1))
+    pixels = np.array([[30, 25], [50, 40]])
+    starts, ends = pixels + np.array([-2.0, -0.7]), pixels + np.array([18.0, 6.7])
+    result = matching.match_along_epipolar_segments(first, second, pixels, starts, ends, 5)
+    np.testing.assert_array_equal(result, pixels + np.array([9, 3]))
+    expected_sum = int(np.abs(first[20:31, 25:36].astype(int) - second[20:31, 28:39].astype(int)).sum())
+    assert matching.sum_absolute_differences(first, second, 25, 30, 25, 33, 5, 2**62) == expected_sum
+
+
+def test_correct_matches_pass_the_forward_backward_check(scene: Pass, landing_scene: LandingScene) -> None:
+    pixels = pixel_lattice((320, 240), 16, 6)
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    _, _, is_inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
+    pixels, positions = pixels[is_inside].astype(np.int64), positions[is_inside]
+    true_pixels = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
+    forward_backward_px = forward_backward_error(
+        landing_scene.views, scene.second_from_first, pixels, true_pixels, positions, (7.0, 13.0), 5
+    )
+    # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.
+    assert np.mean(forward_backward_px <= 1.5) > 0.98
+
+
+def test_segment_position_determines_depth(scene: Pass, landing_scene: LandingScene) -> None:
+    # With both depth bounds at the true depth, both ends are the true match: Eqs. 6-8 of the landing paper are
+    # exact through the lens.
+    pixels = np.array([[100.0, 80.0]])
+    depth = float(true_depths(scene, pixels)[0])
+    true_pixels = scene.camera(1).project(scene.ground(0, pixels))[0]
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    starts, ends, _ = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (depth, depth), 6)
+    np.testing.assert_allclose(starts, true_pixels, atol=1e-6)
+    np.testing.assert_allclose(ends, true_pixels, atol=1e-6)
+
+
+def test_segments_contain_the_exact_match(scene: Pass, landing_scene: LandingScene) -> None:
+    pixels = pixel_lattice((320, 240), 16, 10)
+    true_pixels = scene.camera(1).project(scene.ground(0, pixels))[0]
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    view, motion = landing_scene.views[1], scene.second_from_first
+    starts, ends, is_inside = epipolar_segments(view, motion, positions, (7.0, 13.0), 6)
+    assert is_inside.sum() > 100
+    segments = (ends - starts)[is_inside]
+    length = np.linalg.norm(segments, axis=1)
+    offset = (true_pixels - starts)[is_inside]
+    fraction = np.sum(offset * segments, axis=1) / length**2
+    assert np.all((fraction > 0.0) & (fraction < 1.0))
+    # Lens distortion bends the epipolar line by a few hundredths of a pixel over 25 px.
+    normal_distance = np.abs(offset[:, 0] * segments[:, 1] - offset[:, 1] * segments[:, 0]) / length
+    assert normal_distance.max() < 0.1
+
+
+def test_triangulation_is_exact_and_precision_follows_parallax() -> None:
+    rng = np.random.default_rng(3)
+    positions = rng.uniform(-0.3, 0.3, (2000, 2))
+    depths = rng.uniform(9.0, 11.0, 2000)
+    true_motion = rigid(Rotation.from_rotvec([0.02, -0.03, 0.05]), np.array([1.0, 0.0, 0.0]))
+    points = true_motion.apply(np.column_stack([positions, np.ones(2000)]) * depths[:, None])
+    second = points[:, :2] / points[:, 2:]
+    np.testing.assert_allclose(triangulate(positions, second, true_motion), depths, rtol=1e-10)
+    noise = 1e-4
+    noisy = triangulate(positions, second + rng.normal(0.0, noise, second.shape), true_motion)
+    # dz = z^2 / baseline times the error along the epipolar line; rotation and field of view change this by
+    # several percent.
+    assert np.std((noisy - depths) / depths**2) == pytest.approx(noise, rel=0.1)

@@ -237,3 +237,50 @@ def test_positions_whose_window_leaves_an_image_are_not_refined() -> None:
     assert np.isnan(pixels[:2]).all()
     assert np.isnan(correlations[:2]).all()
     np.testing.assert_allclose(pixels[2], [20.0, 20.0], atol=0.5)
+
+
+def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
+    row, column = np.mgrid[-1.0:2.0, -1.0:2.0]
+    z = 0.9 - 0.3 * (row - 0.2) ** 2 - 0.2 * (column + 0.35) ** 2 - 0.1 * (row - 0.2) * (column + 0.35)
+    np.testing.assert_allclose(matching.fit_biquadratic_peak(z), (0.2, -0.35, 0.9), atol=1e-12)
+
+
+def test_features_leaving_the_image_are_rejected() -> None:
+    scene = make_pass((0.0, -1.0, 10.0, 20.0))
+    first, second, features, true_pixels = render_features(scene)
+    tracks = track_features(first, second, features, features, 60, OPTIONS)
+    is_outside = ~make_camera().in_frame(true_pixels)
+    assert is_outside.sum() >= 3
+    assert not np.any(tracks.accepted & is_outside)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-38, 33), (40, 40)])
+def test_integer_shifts_within_the_window_are_recovered(shift: tuple[int, int]) -> None:
+    # Coarse levels need image content at all scales.
+    rng = np.random.default_rng(4)
+    spectrum = np.fft.rfft2(rng.standard_normal((240, 320)))
+    frequency = np.hypot(np.fft.fftfreq(240)[:, None], np.fft.rfftfreq(320)[None])
+    frequency[0, 0] = np.inf
+    values = np.fft.irfft2(spectrum / frequency, (240, 320))
+    first = np.rint(500.0 + 100.0 * values / values.std()).clip(0, 4095).astype(np.uint16)
+    second = np.roll(first, shift[::-1], axis=(0, 1))
+    features = select_features(first, OPTIONS)
+    # Only features that are not affected by the periodic border.
+    features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
+    tracks = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
+    assert len(features) > 10
+    # The biquadratic fit is biased on texture as fine as pixels.
+    is_correct = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
+    assert is_correct.mean() > 0.9
+    assert np.all(tracks.correlations[is_correct] > 0.98)
+
+
+def test_search_starts_at_predicted_positions() -> None:
+    scene = make_pass((0.0, -1.8, 10.0, 20.0))
+    first, second, features, true_pixels = render_features(scene)
+    is_inside = np.all((true_pixels > 30) & (true_pixels < np.array([290, 210])), axis=1)
+    # Features move by at least 70 px: without a prediction they leave the search window.
+    unpredicted = track_features(first, second, features, features, 40, OPTIONS)
+    predicted = track_features(first, second, features, true_pixels + 9.0, 40, OPTIONS)
+    assert np.mean(np.hypot(*(unpredicted.second - true_pixels).T)[is_inside] < 1.0) < 0.1
+    assert np.mean(np.hypot(*(predicted.second - true_pixels).T)[is_inside] < 1.0) > 0.9

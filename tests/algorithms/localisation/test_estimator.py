@@ -317,3 +317,10 @@ def test_start_resets_the_estimator(make_stages: Callable[..., Stages]) -> None:
     assert list_outcomes(second) == list_outcomes(first)
     assert first[-1].position_m is not None
     np.testing.assert_array_equal(second[-1].position_m, first[-1].position_m)
+
+
+def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Callable[..., Stages]) -> None:
+    """All landmarks show a tilt of 5 deg, 87 standard deviations; a subset near the nadir fits the wrong state."""
+    make_stages([ERROR_M[:2] + np.array([0.0, 150.0])], [np.radians([5.0, 0.0, 0.0])] * 3)
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]

@@ -1,6 +1,7 @@
 """Tests of the navigation filter for localisation on a map: an analytic descent with exact inertial increments."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -420,3 +421,45 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     # posterior of prior and common error alone: 1 / (1 / 50^2 + 1 / 6^2), and 10 m in the height
     minimum = 1.0 / np.sqrt(1.0 / 50.0**2 + 1.0 / np.array([6.0, 6.0, 10.0]) ** 2)
     assert np.all(deviations[1] > 0.999 * minimum)
+
+
+def test_transition_matches_numerical_differences(truth: Descent, exact: ImuIncrements) -> None:
+    """One step of 0.1 s and 40 steps, element by element."""
+    start = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
+    history = IncrementHistory(exact.times_s, exact.period_s, exact.delta_angles_rad, exact.delta_velocities_m_s)
+    times, gravity, step = 0.1 * np.arange(1, 41), np.array([0.0, 0.0, -GRAVITY]), 0.1
+
+    def propagate(errors: np.ndarray) -> list[NavigationState]:
+        changed = start.correct(errors, np.eye(15))
+        return inertial.propagate_states(changed, history, times, GRAVITY, ImuErrorModel())
+
+    transitions = []
+    states = [start, *propagate(np.zeros(15))]
+    for before, after in pairwise(states):
+        rotations = truth.motion(np.linspace(before.time_s, after.time_s, 41)).attitudes.as_matrix()
+        moved = after.position_m - before.position_m - before.velocity_m_s * step
+        transitions.append(
+            inertial.compute_transition(
+                after.velocity_m_s - before.velocity_m_s - gravity * step,
+                moved - 0.5 * gravity * step**2,
+                np.asarray(np.trapezoid(rotations, dx=step / 40, axis=0)),
+                step,
+            )
+        )
+    total = np.linalg.multi_dot(transitions[::-1])
+    sizes = np.repeat([1.0, 1.0, 1e-4, 1e-4, 1e-2], 3)
+    for column in range(15):
+        error = sizes[column] * np.eye(15)[column]
+        plus, minus = propagate(error), propagate(-error)
+        for number, analytic, tolerance in ((0, transitions[0], 0.05), (39, total, 2e-3)):
+            numeric = state_difference(plus[number], minus[number]) / (2.0 * sizes[column])
+            for first in range(0, 15, 3):
+                rows = slice(first, first + 3)
+                expected = analytic[rows, column]
+                block = analytic[rows, 3 * (column // 3) : 3 * (column // 3) + 3]
+                # Effects of biases on position and velocity: the increments' sums neglect a gyro bias within an
+                # interval (1.5 / 40 of the first step, 1.5 / 1600 of all), and rotation in a step. Others: rounding.
+                # Relative to the largest element of the block of three columns.
+                is_bias = column >= 9 and first < 6
+                allowed = (tolerance if is_bias else 1e-6) * np.abs(block).max() + 1e-9
+                assert np.abs(numeric[rows] - expected).max() < allowed, (number, column, first)

@@ -4,15 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, frame_centre, mast_angles
-from marsyard.algorithms.vtt.prediction import bearing_rad, horizontal_axis, magnification, roll_angle, roll_points
+from marsyard.algorithms.vtt.prediction import (
+    bearing_rad,
+    designated_position_world,
+    horizontal_axis,
+    magnification,
+    predicted_position,
+    roll_angle,
+    roll_points,
+)
 from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
-from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
+from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
 from tests.algorithms.vtt.synthetic_drive import MAST, navcam, pancam, pose
 
 
@@ -187,3 +195,58 @@ def test_diverging_lines_of_sight_have_no_range() -> None:
     assert triangulate(left, right, left_pixel, right_pixel) is not None
     assert triangulate(left, right, left_pixel, right_pixel + np.array([3.0, 0.0])) is None  # they diverge
     assert triangulate(left, left, left_pixel, left_pixel) is None
+
+
+def draw_pose(rng: np.random.Generator) -> RigidTransform:
+    """Draw a pose with a random attitude and position."""
+    return rigid(Rotation.random(rng=rng), rng.normal(0.0, 5.0, 3))
+
+
+@pytest.mark.parametrize("roll_deg", [-30.0, -3.0, 0.0, 12.0, 80.0])
+def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
+    camera = navcam().left
+    # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
+    roll_motion = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
+    target = camera.c + 5.0 * camera.rays(frame_centre(camera))[1]
+    points = roll_points(target, camera, camera, roll_motion.inv(), 0.05)
+    assert points is not None
+    roll = roll_angle(points)
+    # The lens axis is 5 px from the rotation centre: the target moves in the image.
+    assert np.degrees(roll) == pytest.approx(-roll_deg, abs=0.3)
+
+
+def test_mast_rotates_about_both_axes_in_order() -> None:
+    for azimuth, elevation in ((0.7, -0.4), (-2.1, 0.3)):
+        pan = Rotation.from_rotvec([0.0, 0.0, -azimuth])
+        rotation = pan * Rotation.from_rotvec([0.0, -elevation, 0.0])
+        rover_from_head = MAST.rover_from_head(azimuth, elevation)
+        np.testing.assert_allclose(rover_from_head.rotation.as_matrix(), rotation.as_matrix(), atol=1e-14)
+        position = MAST.base_m + pan.apply(MAST.elbow_m) + rotation.apply(MAST.head_m)
+        np.testing.assert_allclose(rover_from_head.translation, position, atol=1e-14)
+
+
+def test_rover_and_site_coordinates_agree() -> None:
+    # Site coordinates are north, east, down: 3 m north, 4 m east and 1 m below the origin.
+    site = designated_position_world(SiteTarget(np.array([3.0, 4.0, 1.0])), pose(9.0, 9.0, 1.0))
+    np.testing.assert_allclose(site, [4.0, 3.0, -1.0], atol=1e-12)
+    # For a rover at (4, 1) that faces north, the target is 2 m ahead and 1 m below.
+    rover = designated_position_world(RoverTarget(np.array([2.0, 0.0, -1.0])), pose(4.0, 1.0, np.pi / 2))
+    np.testing.assert_allclose(rover, site, atol=1e-12)
+
+
+def test_target_is_fixed_while_the_rover_moves() -> None:
+    # 5 m ahead; after a drive of 1 m and a left turn of 90 deg the target is 4 m to the right.
+    predicted = predicted_position(np.array([5.0, 0.0, 0.2]), pose(0.0, 0.0), pose(1.0, 0.0, np.pi / 2))
+    np.testing.assert_allclose(predicted, [0.0, -4.0, 0.2], atol=1e-12)
+    rng = np.random.default_rng(1)
+    old, new, point = draw_pose(rng), draw_pose(rng), rng.normal(size=3)
+    np.testing.assert_allclose(new.apply(predicted_position(point, old, new)), old.apply(point), atol=1e-12)
+
+
+@pytest.mark.parametrize("mast", [navcam(), pancam()])
+def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
+    rng = np.random.default_rng(4)
+    for point in rng.uniform([2.0, -0.15, -0.15], [12.0, 0.15, 0.15], (20, 3)):
+        result = triangulate(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
+        assert result is not None
+        np.testing.assert_allclose(result, point, atol=1e-6)

@@ -1,11 +1,16 @@
 """Tests of loss criteria, states and hand-off of tracking, of placement, and of the accuracy formulas (Table I)."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.accuracy import (
+    NAVCAM,
     PANCAM,
+    StereoDesign,
+    accuracy_row,
     drift_error_m,
     round_half_up,
     stereo_range_error_m,
@@ -22,7 +27,8 @@ from marsyard.algorithms.vtt.arm import (
 )
 from marsyard.algorithms.vtt.losses import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.options import VttOptions
-from tests.algorithms.vtt.synthetic_drive import navcam
+from marsyard.sim.measurements import MastCalibration
+from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
 OPTIONS = VttOptions()
 #: Evidence of a correct match.
@@ -176,3 +182,51 @@ def test_errors_scale_with_range_and_focal_length() -> None:
 )
 def test_half_digits_are_rounded_away_from_zero(value: float, digits: int, expected: float) -> None:
     assert round_half_up(value, digits) == expected
+
+
+def test_state_without_target_is_unchanged() -> None:
+    assert next_state(TrackingState.NO_TARGET, 0, True, 2) == (TrackingState.NO_TARGET, 0)
+
+
+@pytest.mark.parametrize("mast", [navcam(), pancam()])
+def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
+    # 1 px (3 sigma) in two disparities and 20 % (3 sigma) of a 1 m step. Less than 0.3 % exceed the root sum square
+    # before the constant term of the tolerance is added.
+    rng = np.random.default_rng(1)
+    # range = focal length x baseline / disparity
+    range_disparity = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
+    old, new = (range_disparity / (range_disparity / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
+    correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
+    tolerance = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
+    assert np.mean(np.abs(correction) > tolerance.distance_m) < 0.003
+    assert np.quantile(np.abs(correction), 0.99) > tolerance.distance_m * 0.45  # the tolerance is not much too large
+
+
+def test_table_1_requires_the_specified_pixel_pitch() -> None:
+    # The text of the paper derives a pitch of 4.69 um from the sensor size (4.8 mm / 1024); with this pitch the errors
+    # would be 9.8 and 39.1 cm.
+    designs = [
+        StereoDesign(design.name, design.focal_length_m, 4.8e-3 / 1024, design.baseline_m)
+        for design in (PANCAM, NAVCAM)
+    ]
+    assert [accuracy_row(design).designation_cm for design in designs] == [9.8, 39.1]
+
+
+def test_ten_pixel_drift_matches_the_paper() -> None:
+    # "Even with an extreme 10-pixel drift, ... 0.7 cm for pancam and 2.3 cm with navcam."
+    pancam, navcam = table_1()
+    assert round_half_up(pancam.tracked_cm(10.0), 1) == 0.7
+    assert round_half_up(navcam.tracked_cm(10.0), 1) == 2.3
+
+
+def test_tolerances_decrease_with_target_distance() -> None:
+    distances = [10.0 * 0.9**i for i in range(16)]
+    step_tolerances = [
+        tolerances(Distances(10.0, old, new, old - new, 10.0 - new), navcam().left, navcam().right, OPTIONS)
+        for old, new in pairwise(distances)
+    ]
+    assert np.all(np.diff([step.distance_m for step in step_tolerances]) < 0.0)
+    assert step_tolerances[-1].distance_m < 0.11
+    # The initial designation uncertainty and the rover drift remain: the tolerance is never below either of them.
+    # 0.409 m is the range error of the designation at 10 m.
+    assert min(step.position_m for step in step_tolerances) > 0.409

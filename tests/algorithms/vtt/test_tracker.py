@@ -386,3 +386,30 @@ def test_target_outside_all_images_is_abandoned() -> None:
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     states = [drive.tracker.update(other_direction).state for _ in range(3)]
     assert states == [TrackingState.LOST, TrackingState.LOST, TrackingState.FAILURE]
+
+
+def test_driving_backwards_shrinks_the_template() -> None:
+    target = np.array([4.0, 0.1, 0.2])
+    drive = start_drive(target, 2)
+    for x in (-0.4, -0.8, -1.2):
+        update = drive.stop(pose(x, 0.0))
+        change = get_details(update).change
+        assert update.tracked
+        assert 0.88 < change.magnification < 0.93
+        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
+
+
+@pytest.mark.slow
+def test_track_drifts_without_subpixel_matching() -> None:
+    # Each of 32 steps adds an error of up to half a pixel (0.4 px rms), which later steps magnify: about 6 px in total.
+    drifts = []
+    for seed in (0, 3):
+        target = np.array([10.0, 0.0, 0.2])
+        drive = Drive(
+            make_scene(make_face(seed, target), target, seed),
+            navcam(),
+            VisualTargetTracker(replace(SMALL_WINDOW, subpixel=False, min_match_score=0.0)),
+        )
+        true_pose, last = drive_to_target(drive, target, 0.05)[-1]
+        drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
+    assert max(drifts) > 2.5

@@ -227,3 +227,9 @@ def get_worker_number(_: int) -> str:
 
 def test_workers_are_numbered() -> None:
     assert set(list_results(run_items(get_worker_number, range(4), jobs=2)).values()) == {"0", "1"}
+
+
+@pytest.mark.slow
+def test_number_of_worker_processes_is_respected() -> None:
+    assert set(list_results(run_items(get_process_id, range(5))).values()) != {os.getpid()}
+    assert len(set(list_results(run_items(get_process_id, range(20), jobs=2)).values())) == 2

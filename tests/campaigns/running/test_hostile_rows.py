@@ -6,6 +6,10 @@ from typing import Any
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.campaign_report import write_report
+from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.stored import read_run
+from marsyard.reports.verdicts import Status
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 from tests.campaigns.hostile_scenario import FAULTS
 
@@ -57,3 +61,18 @@ def test_sampled_values_of_crashed_cases_are_stored(hostile_campaign: Path, rows
     campaign = load_campaign(str(next(hostile_campaign.parent.glob("*.toml"))))
     assert len({row["height_m"] for row in rows}) == len(rows)
     assert [row["height_m"] for row in rows] == [campaign.draws(row["case"])["height_m"] for row in rows]
+
+
+def test_crashed_cases_count_as_failures_of_their_population(hostile_campaign: Path) -> None:
+    stored_run = read_run(hostile_campaign)
+    (verdict,) = evaluate_requirements(stored_run.frame, stored_run.requirements)
+    assert (verdict.status, verdict.n, verdict.failures) == (
+        Status.FAIL,
+        24,
+        2 * sum(bool(reason) for _, reason in FAULTS),
+    )
+
+
+def test_report_of_hostile_campaign_is_written(hostile_campaign: Path) -> None:
+    write_report(hostile_campaign)
+    assert "the algorithm raised" in (hostile_campaign / "report.html").read_text(encoding="utf-8")

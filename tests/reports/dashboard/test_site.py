@@ -14,11 +14,12 @@ from markupsafe import escape
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
-from marsyard.reports import report_file
+from marsyard.reports import signature
 from marsyard.reports.campaign_report import write_report
 from marsyard.reports.dashboard.entries import find_campaigns, make_slug, read_entries
+from marsyard.reports.dashboard.excerpts import read_excerpts
 from marsyard.reports.dashboard.requirement_rows import margin_text, requirement_rows, sparkline
-from marsyard.reports.dashboard.site import read_excerpts, write_site
+from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.page_environment import script_hash
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.verdicts import Status, Verdict
@@ -151,7 +152,7 @@ def test_changed_requirement_is_marked_and_comes_last(make_run: MakeRun, tmp_pat
 def test_report_on_other_requirements_is_not_that_of_the_campaign(make_run: MakeRun, tmp_path: Path) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory, [{**VELOCITY, "probability": 0.1}])
-    assert not report_file.is_own_report(directory, directory)
+    assert not signature.is_own_report(directory, directory)
     (entry,), _ = read_entries([directory], tmp_path / "pages")
     assert entry.report.verdicts[0].probability == VELOCITY["probability"]
 
@@ -161,10 +162,10 @@ def test_reports_of_another_program_are_written_again(
 ) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory)
-    monkeypatch.setattr(report_file, "hash_program", lambda: "another version")
-    assert not report_file.is_own_report(directory, directory)
+    monkeypatch.setattr(signature, "hash_program", lambda: "another version")
+    assert not signature.is_own_report(directory, directory)
     write_site(tmp_path / "site", [directory])
-    assert report_file.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
+    assert signature.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
 
 
 def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:

@@ -266,3 +266,8 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     # The camera circles the centre of the targets at a constant distance.
     ranges = [stop.range_m for stop in second_target.stops]
     assert np.ptp(ranges) < 0.15
+
+
+def test_target_behind_the_camera_has_an_infinite_error() -> None:
+    row = run_custom_tracker("BehindTracker").row
+    assert (row["max_error_px"], row["drift_px"], row["track_margin_px"]) == (np.inf, np.inf, -np.inf)

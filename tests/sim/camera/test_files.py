@@ -1,5 +1,6 @@
 """Tests of camera files: PDS3 labels, JPL's CAHVOR text files, round trips and error messages."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -360,3 +361,18 @@ def test_text_files_without_dimensions_use_the_given_size(tmp_path: Path) -> Non
     assert choice.validate_python({"file": str(without_size), "size": [1024, 1024]}).size == (1024, 1024)
     with pytest.raises(ValueError, match=r"size is \[1024\]; allowed: \[columns, rows\]"):
         choice.validate_python({"file": str(without_size), "size": [1024]})
+
+
+@pytest.mark.slow
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from([CMOD_TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30)
+)
+def test_damaged_files_raise_file_errors(
+    tmp_path: Path, text: str, position: int, insertion: bytes, removed: int
+) -> None:
+    original = text.encode("latin-1")
+    path = tmp_path / "damaged"
+    path.write_bytes(original[:position] + insertion + original[position + removed :])
+    with contextlib.suppress(CameraFileError):
+        assert len(read_cameras(path)) == 1

@@ -115,3 +115,18 @@ def test_inconsistent_parameters_are_rejected() -> None:
     assert len(make_flight(collection_s=1280.0, min_climb_m_s=1.0, max_climb_m_s=1.0).passes) == 15
     with pytest.raises(ValueError, match="outside of the motion"):
         make_flight().state(3000.0)
+
+
+@pytest.mark.slow
+def test_rates_of_climb_are_uniform() -> None:
+    """Between 1 and 2 m/s: mean 1.5, standard deviation 1 / sqrt(12). Tolerances: four standard errors of 400 passes.
+
+    The maximum height does not select the rates of the first five passes: they climb by at most 5 x 70 s x 2 m/s, or
+    700 m.
+    """
+    rates = np.array([leg.climb_m_s for seed in range(80) for leg in draw_default_flight(seed).passes[:5]])
+    assert rates.min() >= 1.0
+    assert rates.max() <= 2.0
+    assert rates.mean() == pytest.approx(1.5, abs=4.0 * np.sqrt(1.0 / 12.0 / 400))
+    # the variance of the variance of a uniform distribution of width 1 is 1/180 for each sample
+    assert rates.var() == pytest.approx(1.0 / 12.0, abs=4.0 * np.sqrt(1.0 / 180.0 / 400))

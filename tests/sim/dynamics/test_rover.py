@@ -10,7 +10,7 @@ from marsyard.sim.dynamics.driven_ground import DrivenGround, RockyGround
 from marsyard.sim.dynamics.driving import SlipParameters, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, compute_wheel_centres, settle
 from marsyard.sim.measurements import DriveCommand
-from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import NO_SLIP, Mounds, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
@@ -250,3 +250,38 @@ def test_drives_are_reproducible_and_continuous() -> None:
     for part, next_part in zip(first.parts, first.parts[1:], strict=False):
         assert part.after is next_part.before
     assert all(part.command.length_m <= 0.2 + 1e-12 for part in first.parts)
+
+
+def test_target_stays_ahead_when_the_rover_circles_it() -> None:
+    distance_m, turn_rad = 7.0, np.radians(10.0)
+    command = DriveCommand(left_m=-distance_m * turn_rad, turn_left_rad=turn_rad)
+    start = settle(MER, Plane(), 0.0, 0.0, EAST)
+    end = drive(MER, Plane(), NO_SLIP_SOIL, start, command, _rng()).end
+    target = end.world_from_rover.inv().apply(np.array([distance_m, 0.0, 0.0]))
+    assert target == pytest.approx([distance_m, 0.0, 0.0], abs=1e-7)
+    # A left turn around the target moves the rover right of its initial heading.
+    assert end.world_from_rover.translation[1] < 0.0
+
+
+def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
+    # The tops of block and mound are wider than the wheel's contact.
+    height_m = 0.10
+    ground = RockyGround.from_triangles(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
+    stance = settle(MER, ground, 0.0, 0.0, EAST)
+    mound = settle(MER, Mounds(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
+    assert np.abs(stance.gaps_m).max() < 1e-6
+    assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
+
+
+def test_rock_of_a_field_lifts_the_wheel() -> None:
+    surface = Surface.from_samples(np.zeros((128, 128, 2), dtype=np.float32), 0.1)
+    rock = PlacedRock(name="step", east_m=6.4 + 0.705, north_m=6.4 + 0.53, diameter_m=0.3, height_m=0.1)
+    field = RockField.draw(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    mesh = field.rock(0, detail=0)
+    ground = RockyGround.from_triangles(surface, mesh.vertices[mesh.faces], (6.4, 6.4), 1.5)
+    heights = ground.height(*np.meshgrid(np.linspace(6.9, 7.3, 201), np.linspace(6.7, 7.1, 201)))
+    assert heights.max() == pytest.approx(mesh.vertices[:, 2].max(), abs=0.003)
+    stance = settle(MER, ground, 6.4, 6.4, EAST)
+    assert np.abs(stance.gaps_m).max() < 1e-4
+    assert stance.pitch_rad > 0.0
+    assert stance.differential_rad < 0.0

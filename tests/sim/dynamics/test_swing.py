@@ -339,3 +339,61 @@ def test_error_messages_contain_the_allowed_values() -> None:
         _fly(1, START, 60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
+
+
+def _compute_eigenvalues_by_differences(parameters: SwingParameters, chain: Chain) -> np.ndarray:
+    """Compute eigenvalues of the equations of motion in the east-up plane, linearised at the steady fall."""
+
+    def rates(q: np.ndarray) -> np.ndarray:
+        x, line, lander, dx, dline, dlander = q
+        y = np.zeros(22)
+        y[:6] = [x, 0.0, 2000.0, dx, 0.0, -parameters.descent_rate_m_s]
+        for start, angle, rate in ((6, line, dline), (12, lander, dlander)):
+            y[start : start + 6] = [np.sin(angle), 0, -np.cos(angle), rate * np.cos(angle), 0, rate * np.sin(angle)]
+        y[18:21] = [0.0, 1.0, 0.0]
+        derivatives = compute_derivatives(y, chain, _make_calm_wind())
+        # n'' = (theta'' cos - theta'^2 sin, 0, theta'' sin + theta'^2 cos) for the tilt theta of an axis n.
+        tilt_accelerations = [
+            derivatives[start] * np.cos(angle) + derivatives[start + 2] * np.sin(angle)
+            for start, angle in ((9, line), (15, lander))
+        ]
+        return np.array([dx, dline, dlander, derivatives[3], *tilt_accelerations])
+
+    step = 1e-5
+    columns = [(rates(step * unit) - rates(-step * unit)) / (2.0 * step) for unit in np.eye(6)]
+    return np.linalg.eigvals(np.stack(columns, axis=1))
+
+
+def _compute_eigenvalues_by_matrices(parameters: SwingParameters, chain: Chain, modes: Modes) -> np.ndarray:
+    """Compute eigenvalues of the planar double pendulum: canopy position x, tilts of line and lander; their rates."""
+    # First and second moment S and J of the masses on the line, first moment of the lander, normal force k per radian,
+    # damping c of the hinge.
+    s, j, length = chain.first_moment, chain.second_moment, chain.line_m
+    lander, k, speed, c = (
+        parameters.lander_mass_kg * parameters.mass_centre_m,
+        modes.normal_force_n,
+        parameters.descent_rate_m_s,
+        chain.hinge_damping,
+    )
+    mass = np.array(
+        [
+            [chain.mass_kg, s, lander],
+            [s, j, lander * length],
+            [lander, lander * length, chain.transverse_inertia + lander * parameters.mass_centre_m],
+        ]
+    )
+    damping = np.array([[k / speed, 0.0, 0.0], [0.0, c, -c], [0.0, -c, c]])
+    stiffness = np.diag([0.0, s * GRAVITY, lander * GRAVITY])
+    stiffness[0, 1] = chain.mass_kg * GRAVITY - k
+    inverse = np.linalg.inv(mass)
+    upper = np.hstack([np.zeros((3, 3)), np.eye(3)])
+    return np.linalg.eigvals(np.vstack([upper, np.hstack([-inverse @ stiffness, -inverse @ damping])]))
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.03])
+def test_small_swings_match_the_double_pendulum(ratio: float) -> None:
+    parameters = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=ratio, nod_damping_ratio=ratio)
+    chain, modes = _build_linear_chain(parameters)
+    theory = _compute_eigenvalues_by_matrices(parameters, chain, modes)
+    result = _compute_eigenvalues_by_differences(parameters, chain)
+    np.testing.assert_allclose(np.sort_complex(result), np.sort_complex(theory), atol=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.motion import View
+from benchmarks.validation.motion import View, supersample
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun, Texture
@@ -109,3 +109,35 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
     # With one ray per pixel the error of a straight edge is uniform up to half a pixel: 0.29 px RMS.
     assert errors[0] > 0.2
     assert errors[1] < 0.1
+
+
+#: Rays along each side of a pixel in the reference image.
+RAYS_PER_SIDE = 16
+
+
+@pytest.fixture(scope="module")
+def reference(renderer: Renderer, rocky_view: View) -> np.ndarray:
+    """Render the radiance with 256 rays per pixel; ground and texture are smoothed over a pixel."""
+    one_ray_view = replace(rocky_view, scene=replace(rocky_view.scene, edge_rays=1))
+    return supersample(renderer, replace(one_ray_view, footprint=float(RAYS_PER_SIDE)), RAYS_PER_SIDE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("side", "max_error_ratio"), [(2, 0.5), (3, 0.4)])
+def test_outlines_match_256_rays_per_pixel(
+    renderer: Renderer, rocky_view: View, reference: np.ndarray, side: int, max_error_ratio: float
+) -> None:
+    one_ray_view = replace(rocky_view, scene=replace(rocky_view.scene, edge_rays=1))
+    rays = rocky_view.rays(rocky_view.camera)
+    single_ray = renderer.render(one_ray_view.scene, rays, rocky_view.world_from_body)
+    multiple_rays = renderer.render(replace(rocky_view.scene, edge_rays=side), rays, rocky_view.world_from_body)
+    edges = np.flatnonzero(single_ray.radiance != multiple_rays.radiance)
+    assert 500 < edges.size < 0.2 * single_ray.radiance.size
+
+    def compute_error(radiance: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((radiance - reference).ravel()[edges] ** 2)) / reference.mean())
+
+    assert compute_error(multiple_rays.radiance) < max_error_ratio * compute_error(single_ray.radiance)
+    # The mean brightness at outlines is unbiased.
+    mean_error = (multiple_rays.radiance - reference).ravel()[edges].mean() / reference.mean()
+    assert abs(mean_error) < 0.1 * compute_error(single_ray.radiance)

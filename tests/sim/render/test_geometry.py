@@ -7,15 +7,17 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground
+from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
-from marsyard.sim.render.ground import Extent, first_crossing
+from marsyard.sim.render.ground import Extent, first_crossing, skip_empty_blocks
 from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from tests.sim.scenes import descent_camera, flat_ground
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
@@ -191,3 +193,96 @@ def test_image_does_not_depend_on_earlier_images(renderer: Renderer, terrain: Su
     repetition = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
     assert first.radiance.tobytes() == repetition.radiance.tobytes()
     assert first.range_m.tobytes() == repetition.range_m.tobytes()
+
+
+STRONG_DISTORTION = (0.01, -0.25, 0.08)
+
+
+def _compute_centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Compute the centroid (column, row) of brightness above the background within 8 pixels of a position."""
+    u0, v0 = np.rint(position).astype(int)
+    patch = radiance[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9].astype(np.float64)
+    border = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
+    weight = np.clip(patch - np.median(border), 0.0, None)
+    v, u = np.mgrid[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9]
+    return np.asarray(np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
+
+
+def _compute_expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
+    """Compute the centroid of a spot's image: the mean pixel of its points, weighted by brightness and image area.
+
+    Perspective shifts it by about 0.01 px from the pixel of the centre.
+    """
+    offset = np.linspace(-15.0, 15.0, 31)
+    dx, dy = np.meshgrid(offset, offset)
+    points = spot + np.stack([dx, dy, np.zeros_like(dx)], axis=-1)
+    area = np.abs(np.linalg.det(camera.projection_jacobian(points)[..., :2]))
+    # The B-spline adds a variance of 1/3 sample^2 to the spot of 2.5 samples; a sample is 1.5 m.
+    variance = (2.5**2 + 1.0 / 3.0) * 1.5**2
+    weight = area * np.exp(-(dx**2 + dy**2) / (2.0 * variance))
+    pixels, _ = camera.project(points)
+    return np.asarray((weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum())
+
+
+def _make_spotted_plane(height_m: float) -> tuple[Surface, np.ndarray]:
+    """Make a plane with bright spots; return the surface and the spot positions in world axes, m, shape (n, 3).
+
+    A spot is a Gaussian of 2.5 samples in the control values. The symmetric B-spline preserves its centre.
+    """
+    side, spacing = 512, 1.5
+    rng = np.random.default_rng(4)
+    grid = (np.arange(13) + 0.5) * side / 13
+    x, y = (centre + rng.uniform(-5, 5, (13, 13)) for centre in np.meshgrid(grid, grid))
+    samples = np.zeros((side, side, 2), dtype=np.float32)
+    samples[..., 0] = height_m
+    samples[..., 1] = 0.05
+    rows, columns = np.mgrid[:side, :side]
+    for spot_x, spot_y in zip(x.ravel(), y.ravel(), strict=True):
+        samples[..., 1] += 0.4 * np.exp(-((columns - spot_x) ** 2 + (rows - spot_y) ** 2) / (2 * 2.5**2))
+    spots = np.stack([x.ravel() * spacing, y.ravel() * spacing, np.full(x.size, height_m)], axis=-1)
+    return Surface.from_samples(samples, spacing), spots
+
+
+def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
+    """Rays skip to the first block whose ceiling is above the ray, in all directions and across the period."""
+    ceiling = terrain.ceilings[0]
+    device_terrain = Terrain.of_surface(terrain, ceilings=True)
+    block = CEILING_BLOCK * terrain.spacing_m
+    rng = np.random.default_rng(5)
+    for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
+        origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), float(ceiling.max()) + 5.0])
+        ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
+        start = rng.uniform(0.0, 50.0)
+        device_ray = Ray(Array3f64(*origin.tolist()), Array3f64(*ray.tolist()))
+        limits = Float64(start), Float64(5000.0)
+        skip_end_m = to_host(skip_empty_blocks(device_terrain, Int32(0), device_ray, *limits, Bool(True)))[0]
+        distances_m = np.arange(start, skip_end_m + 3.0 * block, 0.01 * block)
+        positions = origin + distances_m[:, None] * ray
+        block_row, block_column = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
+        is_below_ceiling = positions[:, 2] <= ceiling[block_row, block_column]
+        assert not is_below_ceiling[distances_m < skip_end_m - 1e-6].any()
+        assert is_below_ceiling[(distances_m > skip_end_m) & (distances_m < skip_end_m + 2.0 * block)].any()
+
+
+@pytest.mark.slow
+def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer) -> None:
+    """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
+    surface, spots = _make_spotted_plane(height_m=7.0)
+    camera = descent_camera(r=STRONG_DISTORTION)
+    pose = rigid(ATTITUDE, np.array([300.0, 700.0, 1207.0]))
+    scene = Scene(surface, (300.0, 400.0), OVERHEAD, ALBEDO_ONLY)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
+    copies = np.arange(-2, 3) * surface.period_m
+    all_spots = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
+    pixels, visible = camera.transform(pose).project(all_spots)
+    is_in_image = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
+    result = np.stack([_compute_centroid(frame.radiance, position) for position in pixels[is_in_image]])
+    expected = np.stack([_compute_expected_centroid(camera.transform(pose), spot) for spot in all_spots[is_in_image]])
+    error = result - expected
+    assert is_in_image.sum() > 400
+    assert np.sqrt(np.mean(np.sum(error**2, axis=-1))) < 0.05
+    assert np.sqrt(np.mean(np.sum((result - pixels[is_in_image]) ** 2, axis=-1))) < 0.05
+    assert np.abs(error.mean(axis=0)).max() < 0.003
+    # The distortion is significant: a pinhole camera would shift the spots by pixels.
+    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(all_spots[is_in_image])
+    assert np.linalg.norm(pinhole - pixels[is_in_image], axis=-1).max() > 20.0

@@ -1,5 +1,7 @@
 """Tests of `Objects` (triangle meshes of several bodies), of the ground mesh, and of shadow footprints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, PixelRays, Renderer, Scene, Sun, process_renderer
@@ -229,3 +231,19 @@ def test_perspective_depths_convert_to_metres() -> None:
     depths_m[1, 2] = 0.0
     # In single precision the rounding of 1 - n / z causes a relative error of 6e-8 z / n in z.
     np.testing.assert_allclose(result, depths_m, rtol=3e-6)
+
+
+def test_footprint_does_not_change_images() -> None:
+    """The images of ground with many rocks under a low sun are bitwise equal."""
+    ground = SiteGround.from_site(site("gusev").model_copy(update={"descent": ROCKY}))
+    rays = PixelRays.from_camera(preset("mer-descent-flown").cameras()[0].bin(4, 4))
+    pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
+    scene = site_scene(ground, Viewpoint.from_pose(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
+    assert len(scene.objects) > 50
+    frame = process_renderer(default_backend()).render(scene, rays, pose)
+    # Replace the cached property: no pixel is excluded from the shadow test.
+    full_scene = replace(scene)
+    full_scene.__dict__["footprint"] = None
+    full_frame = process_renderer(default_backend()).render(full_scene, rays, pose)
+    np.testing.assert_array_equal(frame.radiance, full_frame.radiance)
+    assert not to_host(scene.footprint.cells).all()

@@ -156,3 +156,24 @@ def test_octave_is_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> No
     # The kernel uses the attenuation of the median wavelength of the octave.
     pixel_means = ndimage.uniform_filter(sharp.reshape(side, side), samples_per_pixel, mode="nearest")
     assert np.std(attenuated) / np.std(sharp) == pytest.approx(np.std(pixel_means) / np.std(sharp), abs=0.03)
+
+
+def _make_fisheye_camera() -> Cahvore:
+    pinhole = Cahv.from_focal_length(5.58e-3, 24e-6, (512, 512), **DOWN)
+    return Cahvore.from_cahv(pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006), linearity=-0.1)
+
+
+@pytest.mark.parametrize("is_fisheye", [False, True])
+def test_opposition_peak_is_at_the_antisolar_point(renderer: Renderer, is_fisheye: bool) -> None:
+    """The centroid of the peak is within half a pixel of the antisolar point."""
+    camera = _make_fisheye_camera() if is_fisheye else descent_camera(512)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
+    pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
+    for antisolar_pixel in np.array([[150.3, 201.8], [330.6, 255.1]]):
+        _, ray = camera.transform(pose).rays(antisolar_pixel)
+        frame = renderer.render(Scene(FLAT, (0.0, 0.0), Sun(-ray), law), PixelRays.from_camera(camera), pose)
+        radiance = frame.radiance.astype(np.float64)
+        weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
+        v, u = np.mgrid[:512, :512]
+        peak = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+        assert np.linalg.norm(peak - antisolar_pixel) < 0.5

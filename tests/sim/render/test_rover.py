@@ -9,10 +9,11 @@ from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, Stance, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import Objects, may_cast_shadow
+from marsyard.sim.render import Objects, Renderer, Scene, Sun, may_cast_shadow
 from marsyard.sim.render.rover import ROVER_NAME, rover_objects, rover_sphere
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
-from tests.sim.dynamics.grounds import Mounds, Plane
+from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
+from tests.sim.scenes import LAMBERT, NEAR_MESH, flat_ground, look_down
 
 EAST = 0.5 * np.pi
 
@@ -147,3 +148,33 @@ def test_rover_casts_shadows_only_away_from_the_sun(objects: Objects) -> None:
     assert may_cast_shadow(objects.spheres, sun_direction, np.array([2.5, 0.0, 0.0]), 2.0)
     assert not may_cast_shadow(objects.spheres, sun_direction, np.array([-8.0, 0.0, 0.0]), 0.3)
     assert not may_cast_shadow(objects.spheres, sun_direction, np.array([-2.0, 4.0, 0.0]), 0.3)
+
+
+def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
+    surface = flat_ground(64, 1.0)
+    stance = settle(MER, surface, 32.0, 32.0, 0.0)
+    elevation = np.radians(25.0)
+    sun = Sun(direction(EAST, elevation))
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, edge_rays=1, **NEAR_MESH)
+    # A point high on the mast, whose shadow is outside that of the deck: in the west at height / tan(elevation).
+    mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
+    height_m = 1.28
+    expected = mast + np.array([-height_m / np.tan(elevation), 0.0, 0.0])
+    frame = look_down(renderer, scene, tuple(expected + np.array([0.0, 0.0, 6.0])), 0.1, 101)
+    points = frame.points_world()
+    is_shaded = frame.radiance < 0.1 * frame.radiance.max()
+    assert 0.1 < np.mean(is_shaded) < 0.5
+    # The shadow is a band along the east-west direction, as wide as the mast (radius 0.028 m).
+    band_points = points[is_shaded & (np.abs(points[..., 0] - expected[0]) < 0.1)]
+    assert band_points[:, 1].mean() == pytest.approx(expected[1], abs=0.01)
+    assert np.ptp(band_points[:, 1]) == pytest.approx(2 * 0.028, abs=0.02)
+
+
+def test_rover_tilts_with_the_ground() -> None:
+    stance = settle(MER, uphill_east(10.0), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    on_level_ground = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
+    assert objects.triangles.reshape(-1, 3) == pytest.approx(
+        stance.world_from_rover.apply(on_level_ground.triangles.reshape(-1, 3)), abs=1e-9
+    )

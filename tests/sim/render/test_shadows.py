@@ -15,7 +15,13 @@ from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.casters import are_occluded, casters_towards
 from marsyard.sim.render.cones import Bounds, ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool, UInt32
-from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.ground_shadow import (
+    GroundShadow,
+    compute_ground_shadow,
+    is_sun_above_slopes,
+    periodic_window,
+    slope_bounds,
+)
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from tests.sim.scenes import DOWN, LAMBERT, NEAR_MESH, descent_camera, level_plate, look_down, make_ground, rocks_near
@@ -285,3 +291,11 @@ def test_changed_scene_keeps_no_outdated_shadow(renderer: Renderer) -> None:
         changed = change()
         images = [look_down(renderer, item, (10.0, 10.0, 12.0), 1.2, 96) for item in (changed, replace(changed))]
         np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
+
+
+@pytest.mark.parametrize(("start", "selected"), [(0, [0, 1, 2, 3]), (6, [0, 1, 6, 7]), (-3, [0, 5, 6, 7])])
+def test_periodic_window_keeps_coordinates_modulo_its_period(start: int, selected: list[int]) -> None:
+    """Four of eight samples, also across the ends of the axis."""
+    window = periodic_window(start, 4, 8)
+    assert sorted(window) == selected
+    np.testing.assert_array_equal(window % 4, np.arange(4))

@@ -150,3 +150,43 @@ def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, 
     # The noise of an image is 1 %.
     assert 1e-4 < rms[0] < 0.03
     assert max(rms[3:]) < 0.0015
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 1500.0), (1100.0, -900.0), (37.0, 12.0)])
+def test_moving_dot_is_at_its_mid_exposure_position(velocity: tuple[float, float]) -> None:
+    rows, columns = np.indices((64, 64))
+    dot = np.exp(-0.5 * ((rows - 31.3) ** 2 + (columns - 30.6) ** 2) / 1.5**2).astype(np.float32)
+    image = moving_exposure(dot, np.ones_like(dot), uniform_motion(*velocity), EXPOSURE_S, 0.0, 0.0)
+    total = image.sum(dtype=np.float64)
+    assert total == pytest.approx(dot.sum(dtype=np.float64) * EXPOSURE_S, rel=1e-4)
+    assert (image * rows).sum() / total == pytest.approx(31.3, abs=0.005)
+    assert (image * columns).sum() / total == pytest.approx(30.6, abs=0.005)
+    # Along the motion, the blur over a path of length L adds a variance of L^2 / 12.
+    position_along_motion = ((rows - 31.3) * velocity[0] + (columns - 30.6) * velocity[1]) / np.hypot(*velocity)
+    path = np.hypot(*velocity) * EXPOSURE_S
+    assert (image * position_along_motion**2).sum() / total == pytest.approx(1.5**2 + path**2 / 12.0, rel=0.02)
+
+
+def test_slow_motion_equals_static_exposure() -> None:
+    rng = np.random.default_rng(3)
+    scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
+    result = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
+    rate = scene * response
+    cumulative_rate = np.cumsum(rate, axis=0)
+    static = EXPOSURE_S * rate + 5e-6 * (cumulative_rate - rate) + 1e-6 * (cumulative_rate[-1:] - cumulative_rate)
+    # The tolerance covers the smear, which uses responses averaged over 32 rows.
+    np.testing.assert_allclose(result, static, rtol=1e-3)
+
+
+def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
+    """The charge d rows below the dot passes it d transfer times after the exposure."""
+    rows, columns = np.indices((96, 96))
+    dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
+    image = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
+    for row in (40, 60, 90):
+        centre = (image[row] * columns[row]).sum() / image[row].sum()
+        assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
+    # During clearing the charge of higher rows passes the dot before the exposure; the higher the row, the earlier.
+    clearing_image = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
+    centre = (clearing_image[5] * columns[5]).sum() / clearing_image[5].sum()
+    assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)

@@ -198,3 +198,29 @@ def test_side_lobes_receive_the_ground_at_nadir() -> None:
 def test_true_altitude_is_vertical_height_above_ground() -> None:
     positions = np.array([[MIDDLE + 100.0, MIDDLE, 500.0], [MIDDLE - 50.0, MIDDLE, 500.0]])
     np.testing.assert_allclose(height_above_ground(_make_plane(0.2), positions), [480.0, 510.0], atol=1e-3)
+
+
+def test_error_free_readings_equal_the_truth() -> None:
+    radar = _make_radar(np.random.default_rng(0), **NO_ERRORS)
+    times = radar.sampling.within(0.0, 10.0)
+    readings = radar.measure(DESCENT, times, np.random.default_rng(1))
+    # Flat ground at height 0.
+    np.testing.assert_allclose(readings.values, DESCENT.motion(times).positions_m[:, 2], atol=1e-6)
+    np.testing.assert_array_equal(readings.times_s, times)
+
+
+def test_narrow_beam_measures_the_range_at_its_uphill_edge() -> None:
+    surface = _make_plane(np.tan(np.radians(20.0)))
+    position = np.array([MIDDLE, MIDDLE, 1000.0])
+    result = first_return(surface, position, _make_axis(0.0), np.radians(5.0), 5000.0)
+    # The nearest ray is 5 deg uphill of nadir. Its range r solves r cos 5 = 1000 - r sin 5 tan 20.
+    expected = 1000.0 / (np.cos(np.radians(5.0)) + np.sin(np.radians(5.0)) * np.tan(np.radians(20.0)))
+    assert result == pytest.approx(expected, rel=5e-4)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 30.0, 40.0, 60.0])
+def test_tilt_beyond_half_beam_width_increases_the_range(tilt_deg: float) -> None:
+    position = np.array([0.0, 0.0, 1500.0])
+    result = first_return(FLAT, position, _make_axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
+    off_nadir = max(np.radians(tilt_deg - 30.0), 0.0)
+    assert result == pytest.approx(1500.0 / np.cos(off_nadir), rel=5e-4)

@@ -1,5 +1,8 @@
 """Tests of landforms: their specified shapes, and independence of each other."""
 
+import os
+import subprocess
+import sys
 from typing import Literal
 
 import numpy as np
@@ -237,3 +240,22 @@ def test_dunes_finer_than_the_grid_are_sampled_directly() -> None:
     ripples = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
     heights = synthesise_heights(make_parameters(samples=64, spacing_m=3.0, ripples=ripples))
     assert 0.0 < np.ptp(heights) < 0.1
+
+
+@pytest.mark.slow
+def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
+    program = (
+        "import hashlib, numpy as np\n"
+        "from marsyard.sim.terrain import TerrainParameters, synthesise\n"
+        "from marsyard.sim.terrain.landforms import *\n"
+        "p = TerrainParameters(samples=256, dunes=Dunes(), lava=Lava(), swell=Swell(), playa=Playa())\n"
+        "print(hashlib.sha256(synthesise(p, np.random.default_rng(5)).levels[0].tobytes()).hexdigest())\n"
+    )
+    hashes = set()
+    for threads in ("1", "4"):
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+        environment = {**os.environ, **dict.fromkeys(names, threads)}
+        command = [sys.executable, "-c", program]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        hashes.add(run.stdout.strip())
+    assert len(hashes) == 1

@@ -1,5 +1,7 @@
 """Tests of rock shapes, size distribution, placement and level of detail."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,7 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.field import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.kernels import place_discs
 from marsyard.sim.terrain.rocks.shapes import (
@@ -307,3 +310,23 @@ def test_abrasion_rounds_the_edges_of_rocks_by_different_radii() -> None:
     assert min(blocks) > 0.02
     assert max(blocks) > 8.0 * min(blocks)
     assert np.median(ventifacts) > 0.03
+
+
+@pytest.mark.slow
+def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
+    cache_clears = [
+        function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._compute_max_radius)
+    ]
+    results = []
+    for _ in range(2):
+        for clear_cache in cache_clears:
+            clear_cache()
+        coarse = rock_shapes(COARSE)
+        results.append([coarse.vertices, coarse.normals, coarse.max_radius, max_pixels()])
+        files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
+    # The files contain vertices of five levels, normals of two levels, and the sizes in pixels.
+    assert len(files) == 8
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert not any(array.flags.writeable for array in results[1][:2])
